@@ -115,7 +115,7 @@ fn hit(
     time: Res<Time>,
     keys: Res<ButtonInput<KeyCode>>,
     mut bodies: Query<(Entity, &Part, &BodyState, &mut Account)>,
-    mut strikes: MessageWriter<Impulse>,
+    mut impulses: MessageWriter<Impulse>,
     mut blows: Local<u32>,
 ) {
     let due = time.elapsed_secs_f64() > 0.4 + 1.5 * f64::from(*blows);
@@ -129,10 +129,10 @@ fn hit(
         *blows += u32::from(due);
         let (momentum, _) = state.body().momentum();
         let home = -DVec3::from(state.body().frame().origin());
-        let blow = -DVec3::from(momentum) + 0.18 * home + 0.04 * DVec3::new(0.3, 1.0, 0.6);
+        let impulse = -DVec3::from(momentum) + 0.18 * home + 0.04 * DVec3::new(0.3, 1.0, 0.6);
         let side = [Vec3::X, Vec3::Y, Vec3::NEG_X, Vec3::NEG_Y][*blows as usize % 4];
-        strikes.write(Impulse { body, vertex: farthest(state, side), impulse: blow });
-        account.applied += blow;
+        impulses.write(Impulse { body, vertex: farthest(state, side), impulse });
+        account.applied += impulse;
     }
 }
 

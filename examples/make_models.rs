@@ -104,7 +104,7 @@ const RINGS: usize = 22;
 /// Returns the surface of a fluted jelly as Wavefront OBJ; u runs around it, v from bottom to top.
 fn jelly_surface() -> Result<String, std::fmt::Error> {
     let mut text =
-        String::from("# A jelly with texture coordinates; made by the example make_models. Metres, y up.\n");
+        String::from("# A jelly with texture coordinates; made by the example make_models. Meters, y up.\n");
     for ring in 0..=RINGS {
         let (radius, height, flute) = profile(ring as f64 / RINGS as f64);
         let pole = ring == 0 || ring == RINGS;

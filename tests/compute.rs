@@ -177,7 +177,7 @@ fn the_same_shapes(mut app: App) {
             p.cmpge(aabb.min() - 1e-5).all() && p.cmple(aabb.max() + 1e-5).all()
         }));
     }
-    assert_eq!(on_device(&app, other.id()), torus, "a neighbour in the buffer was written to");
+    assert_eq!(on_device(&app, other.id()), torus, "a neighbor in the buffer was written to");
 
     // The processor deforms the same shapes.
     app.insert_resource(SurfaceDeformation::Processor);

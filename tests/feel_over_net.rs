@@ -13,8 +13,8 @@ use std::{
 use bevy::{math::DVec3, prelude::*, transform::TransformPlugin};
 use pliant::{
     haptics::{
-        DeviceId, Fault, Hand, HapticDevices, HapticFault, HapticTool, HapticsPlugin, LoopConfig, ToolGrip,
-        VirtualConfig, VirtualDevice, VirtualHandle,
+        DeviceId, Fault, HandModel, HapticDevices, HapticFault, HapticTool, HapticsPlugin, LoopConfig,
+        ToolGrip, VirtualConfig, VirtualDevice, VirtualHandle,
     },
     modal::ModalModel,
     net::{Emulation, HandOf, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin, NetStats, SharedBody},
@@ -71,7 +71,7 @@ fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
     app.world_mut().spawn((SharedBody::named("pip"), Transform::default()));
     // Without friction, the hand is where its springs put it.
     let config = VirtualConfig { friction: 0.0, ..VirtualConfig::premium() };
-    let device = VirtualDevice::new(config, Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(config, HandModel::FIRM).unwrap();
     let hand = device.handle();
     let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
     let side = model

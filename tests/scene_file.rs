@@ -140,7 +140,7 @@ fn names_that_are_there_twice_or_not_at_all() {
 #[test]
 fn numbers_out_of_their_range_are_told_where_they_are() {
     for (part, by, wrong, words) in [
-        ("(0.5, 0, 0)", "(0.5, NaN, 0)", "NaN", "expected metres from -1000000 to 1000000, got NaN"),
+        ("(0.5, 0, 0)", "(0.5, NaN, 0)", "NaN", "expected meters from -1000000 to 1000000, got NaN"),
         ("(0.5, 0, 0)", "(inf, 0, 0)", "inf", "got inf"),
         ("stiffness: 200", "stiffness: -1", "-1", "expected N/m above 0 and at most 1000000000, got -1"),
         ("stiffness: 200", "stiffness: 1e999", "1e999", "got inf"),

@@ -248,7 +248,7 @@ fn shake(
 /// Adds a simulated device at the ear. Its hand presses the button and moves while there is work.
 #[cfg(feature = "haptics")]
 fn feel(app: &mut App, company: &mut Company, place: Vec3) -> Result<(), Box<dyn Error>> {
-    use pliant::haptics::{Hand as Grip, LoopConfig, VirtualConfig, VirtualDevice};
+    use pliant::haptics::{HandModel as Grip, LoopConfig, VirtualConfig, VirtualDevice};
 
     let device = VirtualDevice::new(VirtualConfig::premium(), Grip::FIRM)?;
     let hand = device.handle();

@@ -5,7 +5,7 @@ use std::error::Error;
 
 use clap::ValueEnum;
 use pliant::haptics::{
-    FindConfig, ForceDimension, Found, Hand, HapticDevice, Inverse, LoopConfig, OpenHaptics, Positioned,
+    FindConfig, ForceDimension, Found, HandModel, HapticDevice, Inverse, LoopConfig, OpenHaptics, Positioned,
     PositionedHandle, SafetyConfig, StaleConfig, VirtualConfig, VirtualDevice, VirtualHandle, find_devices,
 };
 
@@ -38,12 +38,12 @@ pub enum Grip {
 }
 
 impl Grip {
-    fn hand(self) -> Hand {
+    fn hand(self) -> HandModel {
         match self {
-            Self::Firm => Hand::FIRM,
-            Self::Light => Hand::LIGHT,
-            Self::Loose => Hand::LOOSE,
-            Self::None => Hand::NONE,
+            Self::Firm => HandModel::FIRM,
+            Self::Light => HandModel::LIGHT,
+            Self::Loose => HandModel::LOOSE,
+            Self::None => HandModel::NONE,
         }
     }
 }

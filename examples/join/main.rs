@@ -33,8 +33,8 @@ use bevy::log::Level;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
-    CameraInterest, Invite, JoinConfig, JoinOptions, NetGuest, NetPlugin, Recording, RemoteBody,
-    SessionClosed, SessionJoined, SessionLost, SharedBody,
+    CameraInterest, Invite, JoinConfig, JoinOptions, NetGuest, NetPlugin, RemoteBody, SessionClosed,
+    SessionJoined, SessionLost, SessionRecording, SharedBody,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -162,7 +162,7 @@ fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
         ..default()
     };
     let net = match (&options.replay, &options.invite) {
-        (Some(file), _) => NetPlugin::replay(Recording::open(file)?, config),
+        (Some(file), _) => NetPlugin::replay(SessionRecording::open(file)?, config),
         (None, Some(invite)) => NetPlugin::join(invite, config)?,
         (None, None) => return Err("an invite is needed".into()),
     };

@@ -16,25 +16,25 @@ use pliant::prelude::*;
 /// The data that the two threads share.
 #[derive(Resource, Clone, Default)]
 pub struct Other {
-    seen: Arc<Mutex<Seen>>,
+    view: Arc<Mutex<GuestView>>,
     pub stop: Arc<AtomicBool>,
 }
 
 /// The visual state of the guest, and the input for its hand.
 #[derive(Default)]
-pub struct Seen {
+pub struct GuestView {
     pub q: Vec<f64>,
     /// Targets and patches of the guest's hands, m, and the reactions on them, N.
     pub hands: Vec<(DVec3, DVec3, DVec3)>,
     /// Largest reaction on the guest's hands, N.
-    pub felt: f64,
+    pub reaction: f64,
     /// Position of the stick, -1 to 1 on each axis; `None` releases the body.
     pub stick: Option<DVec3>,
 }
 
 impl Other {
-    pub fn seen(&self) -> MutexGuard<'_, Seen> {
-        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
+    pub fn view(&self) -> MutexGuard<'_, GuestView> {
+        self.view.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -82,7 +82,7 @@ fn pull(
     bodies: Query<(Entity, &BodyState, &GlobalTransform), With<RemoteBody>>,
     mut grabs: Query<(Entity, &mut Grab, &mut Pull)>,
 ) {
-    let stick = other.seen().stick;
+    let stick = other.view().stick;
     let Ok((body, state, place)) = bodies.single() else { return };
     let size = state.model().size();
     match (grabs.single_mut(), stick) {
@@ -116,13 +116,13 @@ fn tell(
     hands: Query<(&Grab, &GrabForce)>,
     mut exit: MessageWriter<AppExit>,
 ) {
-    let mut seen = other.seen();
-    if let Ok(shown) = bodies.single() {
-        seen.q.clear();
-        seen.q.extend_from_slice(shown.q());
+    let mut view = other.view();
+    if let Ok(visual) = bodies.single() {
+        view.q.clear();
+        view.q.extend_from_slice(visual.q());
     }
-    seen.hands = hands.iter().map(|(grab, felt)| (grab.target, felt.point, felt.force)).collect();
-    seen.felt = hands.iter().map(|(_, felt)| felt.force.length()).fold(0.0, f64::max);
+    view.hands = hands.iter().map(|(grab, reaction)| (grab.target, reaction.point, reaction.force)).collect();
+    view.reaction = hands.iter().map(|(_, reaction)| reaction.force.length()).fold(0.0, f64::max);
     if other.stop.load(Ordering::Relaxed) {
         exit.write(AppExit::Success);
     }

@@ -188,17 +188,17 @@ fn steer(
         }
         None => None,
     };
-    other.seen().stick = stick;
+    other.view().stick = stick;
 }
 
 /// Copies the guest's visual state to the body on the right.
 fn mirror(other: Res<Other>, mut bodies: Query<&mut VisualState, With<Mirrored>>) {
-    let seen = other.seen();
-    for mut shown in &mut bodies {
+    let view = other.view();
+    for mut visual in &mut bodies {
         // A resting body is not drawn again.
-        if seen.q.len() == shown.q().len()
-            && seen.q != shown.q()
-            && let Err(error) = shown.snap(&seen.q)
+        if view.q.len() == visual.q().len()
+            && view.q != visual.q()
+            && let Err(error) = visual.snap(&view.q)
         {
             warn_once!("{error}");
         }
@@ -212,11 +212,11 @@ fn draw_hands(
     mut right: Gizmos<RightGizmos>,
 ) {
     let [warm, cool] = [Color::srgb(1.0, 0.80, 0.30), Color::srgb(0.25, 0.55, 1.0)];
-    let seen = other.seen();
-    for (grab, felt) in &hands {
-        stage::draw_hand(&mut left, grab.target, Some(felt.point), -felt.force, warm);
+    let view = other.view();
+    for (grab, reaction) in &hands {
+        stage::draw_hand(&mut left, grab.target, Some(reaction.point), -reaction.force, warm);
     }
-    for &(target, point, force) in &seen.hands {
+    for &(target, point, force) in &view.hands {
         stage::draw_hand(&mut right, target, Some(point), -force, cool);
     }
 }
@@ -242,13 +242,13 @@ fn score(
     mut score: ResMut<Score>,
     mut readout: ResMut<stage::Readout>,
 ) {
-    let Ok((state, shown)) = bodies.single() else { return };
+    let Ok((state, visual)) = bodies.single() else { return };
     let model = state.model();
     let positions = model.surface().positions();
     let Some(top) = (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])) else {
         return;
     };
-    let q = shown.q();
+    let q = visual.q();
     let aside: f64 = q
         .iter()
         .enumerate()
@@ -263,7 +263,11 @@ fn score(
         if side < 0 { score.left += 1 } else { score.right += 1 }
     }
     let pull = |guests: bool| {
-        forces.iter().filter(|(_, of)| *of == guests).map(|(felt, _)| felt.force.length()).fold(0.0, f64::max)
+        forces
+            .iter()
+            .filter(|(_, of)| *of == guests)
+            .map(|(reaction, _)| reaction.force.length())
+            .fold(0.0, f64::max)
     };
     let link = links.iter().next().copied().unwrap_or_default();
     let text = format!(
@@ -272,7 +276,7 @@ fn score(
         score.right,
         pull(false),
         pull(true),
-        other.seen().felt,
+        other.view().reaction,
         link.round_trip.as_secs_f64() * 1e3,
         link.loss_in.max(link.loss_out) * 100.0,
     );

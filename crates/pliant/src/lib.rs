@@ -198,21 +198,21 @@ pub struct Readme;
 ))]
 pub mod book {
     #[doc = include_str!("../../../docs/concepts.md")]
-    pub struct Concepts;
+    pub struct ConceptsPage;
     #[doc = include_str!("../../../docs/first-scene.md")]
-    pub struct FirstScene;
+    pub struct FirstScenePage;
     #[doc = include_str!("../../../docs/baking.md")]
-    pub struct Baking;
+    pub struct BakingPage;
     #[doc = include_str!("../../../docs/contact.md")]
-    pub struct Contact;
+    pub struct ContactPage;
     #[doc = include_str!("../../../docs/multiuser.md")]
-    pub struct Multiuser;
+    pub struct MultiuserPage;
     #[doc = include_str!("../../../docs/devices.md")]
-    pub struct Devices;
+    pub struct DevicesPage;
     #[doc = include_str!("../../../docs/recording.md")]
-    pub struct Recording;
+    pub struct RecordingPage;
     #[doc = include_str!("../../../docs/performance.md")]
-    pub struct Performance;
+    pub struct PerformancePage;
     #[doc = include_str!("../../../docs/limits.md")]
-    pub struct Limits;
+    pub struct LimitsPage;
 }

@@ -29,17 +29,17 @@ impl Plugin for RecordingPanelPlugin {
 
 /// Applies the knobs that have changed since the last frame, and shows the recording as it is.
 fn exchange(
-    mut shown: ResMut<PanelRecording>,
+    mut panel: ResMut<PanelRecording>,
     mut last: Local<Option<RecordingView>>,
     mut settings: ResMut<RerunRecording>,
     stats: Res<RerunStats>,
 ) {
-    if last.as_ref().is_some_and(|last| *last != **shown) {
+    if last.as_ref().is_some_and(|last| *last != **panel) {
         let wanted = RerunRecording {
-            on: shown.on,
-            shapes_hz: shown.shapes_hz,
-            modes_hz: shown.modes_hz,
-            color: if shown.stress { RerunColor::Stress } else { RerunColor::Displacement },
+            on: panel.on,
+            shapes_hz: panel.shapes_hz,
+            modes_hz: panel.modes_hz,
+            color: if panel.stress { RerunColor::Stress } else { RerunColor::Displacement },
             ..*settings
         };
         settings.set_if_neq(wanted);
@@ -54,7 +54,7 @@ fn exchange(
         stress: settings.color == RerunColor::Stress,
     };
     *last = Some(view.clone());
-    **shown = view;
+    **panel = view;
 }
 
 #[cfg(test)]

@@ -64,7 +64,7 @@ impl fmt::Display for Anchor {
 /// Error for a text that is not an anchor.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "anchor `{text}`: expected an axis, a comparison and a finite number of metres, such as `x<0.01`; {problem}"
+    "anchor `{text}`: expected an axis, a comparison and a finite number of meters, such as `x<0.01`; {problem}"
 )]
 pub struct AnchorSyntax {
     /// Received text.

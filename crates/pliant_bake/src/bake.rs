@@ -91,7 +91,7 @@ pub fn bake(
     let pure = if config.material.is_some() { derivatives::pure_modes(config.modes) } else { config.modes };
     let mut modes =
         lanczos::lowest(&solver, pure, &mut |share| progress(Stage::Modes, share)).map_err(no_modes)?;
-    canonical::settle(&mut modes, &matrix, &number);
+    canonical::canonicalize(&mut modes, &matrix, &number);
     let (residual_max, mut orthonormality_max) = accuracy(&matrix, &modes);
     check_accuracy("|K phi - lambda M phi| / |K phi|", residual_max, RESIDUAL_LIMIT)?;
     check_accuracy("|Phi^T M Phi - I|", orthonormality_max, ORTHONORMALITY_LIMIT)?;
@@ -174,7 +174,7 @@ fn simulation_mesh(
     number: &[u32],
     skin: &Skin,
 ) -> Option<SimulationMesh> {
-    if mesh.tets.len() > SimulationMesh::MOST_TETS {
+    if mesh.tets.len() > SimulationMesh::MAX_TETS {
         return None;
     }
     let corners: Vec<[f32; 3]> = mesh.nodes.iter().map(|p| p.map(|x| x as f32)).collect();

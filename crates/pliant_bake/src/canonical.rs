@@ -17,7 +17,7 @@ const CLUSTER: f64 = 1e-10;
 /// weighted by 1, 2, 3 along x, y, z. The bending modes of a round bar then lie in the axes.
 /// Afterwards the largest entry of each mode becomes positive. Among entries within 1e-6 of the
 /// largest, the first in node order decides.
-pub(crate) fn settle(modes: &mut Eigenpairs, matrix: &BlockCsr, number: &[u32]) {
+pub(crate) fn canonicalize(modes: &mut Eigenpairs, matrix: &BlockCsr, number: &[u32]) {
     let count = modes.lambda.len();
     let mut start = 0;
     while start < count {

@@ -27,7 +27,7 @@ pub struct BakeConfig {
     /// With a material the coordinates are the lowest modes (about a third of them) and the most
     /// important combinations of their derivatives, and the model has a reduced elastic energy
     /// beside its linear one. [`BakeConfig::COORDINATES`] are enough for most bodies, and
-    /// [`BakeConfig::MOST_COORDINATES`] is the limit.
+    /// [`BakeConfig::MAX_COORDINATES`] is the limit.
     pub material: Option<Material>,
     /// Young's modulus, 1e-3 to 1e15 Pa. Default: 1e5, a soft silicone.
     pub young: f64,
@@ -85,7 +85,7 @@ impl BakeConfig {
     pub const COORDINATES: usize = 36;
 
     /// Maximum number of coordinates of a model with a [`material`](Self::material).
-    pub const MOST_COORDINATES: usize = 120;
+    pub const MAX_COORDINATES: usize = 120;
 
     /// Checks the numbers that do not depend on the mesh.
     ///
@@ -112,7 +112,7 @@ impl BakeConfig {
             (-0.99..=0.49999).contains(&nu),
             nu,
         )?;
-        let sound = self.material.is_none() || self.modes <= Self::MOST_COORDINATES;
+        let sound = self.material.is_none() || self.modes <= Self::MAX_COORDINATES;
         number("modes", "at most 120 coordinates with a material", sound, self.modes as f64)?;
         let sound = self.material.is_none() || nu <= 0.45;
         number("Poisson ratio", "at most 0.45 with a material for large strains", sound, nu)?;

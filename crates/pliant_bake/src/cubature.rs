@@ -169,6 +169,8 @@ fn pulled(energy: &mut ElasticEnergy, omega: &[f64], patch: &Rows, training: &Tr
     let ways = WAYS.map(|way| way * training.size);
     [(0, 1.0), (0, -1.0), (1, 1.0), (2, 1.0), (2, -1.0)]
         .into_iter()
-        .flat_map(|(axis, sign)| cubature::led(energy, omega, patch, &(sign * axes[axis]), &ways, most))
+        .flat_map(|(axis, sign)| {
+            cubature::guided_shapes(energy, omega, patch, &(sign * axes[axis]), &ways, most)
+        })
         .collect()
 }

@@ -256,7 +256,7 @@ impl HeldVertices {
                 along.iter().zip(&modes.lambda).map(|(phi, lambda)| phi[i] * phi[j] / lambda).sum();
             sum - modal
         };
-        settle(&Matrix3::from_fn(|i, j| 0.5 * (entry(i, j) + entry(j, i))))
+        nearest_semidefinite(&Matrix3::from_fn(|i, j| 0.5 * (entry(i, j) + entry(j, i))))
     }
 }
 
@@ -264,7 +264,7 @@ impl HeldVertices {
 ///
 /// Where the kept modes contain nearly all of the compliance, rounding can make the residual
 /// negative. The nearest positive semi-definite matrix has the negative eigenvalues set to zero.
-fn settle(residual: &Matrix3<f64>) -> [[f64; 3]; 3] {
+fn nearest_semidefinite(residual: &Matrix3<f64>) -> [[f64; 3]; 3] {
     let eigen = residual.symmetric_eigen();
     let nearest = if eigen.eigenvalues.min() < 0.0 {
         let kept = Matrix3::from_diagonal(&eigen.eigenvalues.map(|value| value.max(0.0)));

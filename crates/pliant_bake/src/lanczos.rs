@@ -255,10 +255,10 @@ impl<'a> Lanczos<'a> {
         // to it as well.
         blocks::put(&mut self.basis, self.stride, self.done, &self.next, self.width);
         self.done += self.width;
-        self.orthogonalise(&mut block, fresh, 0);
+        self.orthogonalize(&mut block, fresh, 0);
         self.done -= self.width;
         let (block, Remainder { width: fresh, .. }) =
-            normalise(self.solver, block, fresh).ok_or(Failure::NoConvergence)?;
+            normalize(self.solver, block, fresh).ok_or(Failure::NoConvergence)?;
         let width = self.width + fresh;
         let mut next = vec![0.0; self.solver.dofs() * width];
         blocks::put(&mut next, width, 0, &self.next, self.width);
@@ -271,8 +271,8 @@ impl<'a> Lanczos<'a> {
 
     fn start(&mut self) -> Result<(), Failure> {
         let mut block = self.random(self.width);
-        self.orthogonalise(&mut block, self.width, 0);
-        let (next, remainder) = normalise(self.solver, block, self.width).ok_or(Failure::NoConvergence)?;
+        self.orthogonalize(&mut block, self.width, 0);
+        let (next, remainder) = normalize(self.solver, block, self.width).ok_or(Failure::NoConvergence)?;
         self.next = next;
         self.width = remainder.width;
         if self.width == 0 { Err(Failure::NoConvergence) } else { Ok(()) }
@@ -303,7 +303,7 @@ impl<'a> Lanczos<'a> {
         self.done += width;
         let mut image = self.solver.operator(&self.next, width);
         let scale = image.iter().map(|x| x * x).sum::<f64>();
-        let h = self.orthogonalise(&mut image, width, self.coupled);
+        let h = self.orthogonalize(&mut image, width, self.coupled);
         self.coupled = at;
         for j in 0..width {
             for i in 0..self.done {
@@ -321,7 +321,7 @@ impl<'a> Lanczos<'a> {
         if !scale.is_finite() {
             return Err(Failure::NoConvergence);
         }
-        let (next, remainder) = normalise(self.solver, image, width).ok_or(Failure::NoConvergence)?;
+        let (next, remainder) = normalize(self.solver, image, width).ok_or(Failure::NoConvergence)?;
         if remainder.width == 0 {
             // The space is invariant, so the iteration continues with new random directions.
             self.width = width;
@@ -338,7 +338,7 @@ impl<'a> Lanczos<'a> {
     /// The first pass covers the columns from `coupled` on, where the block has large parts. The
     /// second pass covers all columns, and only rounding is left there. Each large part is
     /// therefore removed twice.
-    fn orthogonalise(&self, block: &mut [f64], width: usize, coupled: usize) -> Mat<f64> {
+    fn orthogonalize(&self, block: &mut [f64], width: usize, coupled: usize) -> Mat<f64> {
         let mut sum = Mat::zeros(self.done, width);
         if self.done == 0 {
             return sum;
@@ -421,7 +421,7 @@ impl<'a> Lanczos<'a> {
 ///
 /// The result satisfies `block = result coefficients`. Returns `None` when the small eigenproblem
 /// fails.
-fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<f64>, Remainder)> {
+fn normalize(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<f64>, Remainder)> {
     let mut coefficients = Mat::<f64>::identity(width, width);
     let mut columns = width;
     for _ in 0..2 {
@@ -458,13 +458,13 @@ fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Eigenpairs, Fai
     let mut mass_x = vec![0.0; x.len()];
     solver.matrix.mass_times(x, wanted, &mut mass_x);
     let mass = blocks::gram(tall, Tall::new(&mass_x, wanted));
-    let (lambda, turn) = generalised(stiffness, mass).ok_or(Failure::NoConvergence)?;
+    let (lambda, turn) = generalized(stiffness, mass).ok_or(Failure::NoConvergence)?;
     Ok(Eigenpairs { lambda, phi: blocks::product(tall, turn.as_ref()) })
 }
 
 /// Solves `A y = lambda B y` for small symmetric A and positive definite B. The eigenvalues are
 /// ascending and `Y^T B Y = I`.
-fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
+fn generalized(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
     let n = a.nrows();
     // The columns of inverse iteration differ in length as 1 / lambda, so they are scaled first.
     let scale: Vec<f64> = (0..n).map(|i| 1.0 / b[(i, i)].sqrt()).collect();
@@ -493,7 +493,7 @@ fn dense(solver: &Solver, wanted: usize) -> Result<Eigenpairs, Failure> {
     solver.matrix.mass_times(&identity, n, &mut m);
     let stiffness = Mat::from_fn(n, n, |i, j| k[i * n + j]);
     let mass = Mat::from_fn(n, n, |i, j| m[i * n + j]);
-    let (lambda, y) = generalised(stiffness, mass).ok_or(Failure::NoConvergence)?;
+    let (lambda, y) = generalized(stiffness, mass).ok_or(Failure::NoConvergence)?;
     let skip = if solver.rigid.is_some() { 6 } else { 0 };
     let mut phi = Vec::with_capacity(n * wanted);
     for i in 0..n {

@@ -8,7 +8,7 @@ use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
     Body, BodyConfig, Capsule, Cuboid, Damping, Elasticity, Frame, GrabConfig, Material, ModalModel, Moving,
-    Obstacle, Patch, Plane, Sphere, StepError, StepSettings, SurfacePoint,
+    ObstacleShape, Patch, Plane, Sphere, StepError, StepSettings, SurfacePoint,
 };
 
 const GRAVITY: f64 = 9.81;
@@ -267,14 +267,14 @@ fn no_contact_ever_adds_energy() {
         ("needle", needle),
         ("reduced", model(&shapes::cube(4, 0.1).unwrap(), 1e5, |c| c.material = Some(Material::NeoHookean))),
     ];
-    let ground: Arc<dyn Obstacle> = Arc::new(Plane::GROUND);
+    let ground: Arc<dyn ObstacleShape> = Arc::new(Plane::GROUND);
     let edge = Cuboid {
         center: [0.05, -0.5, 0.05],
         rotation: [0.0, 0.0, (0.125 * std::f64::consts::PI).sin(), (0.125 * std::f64::consts::PI).cos()],
         half: [0.2, 0.2, 0.2],
         round: 0.0,
     };
-    let obstacles: [(&str, Vec<Arc<dyn Obstacle>>); 4] = [
+    let obstacles: [(&str, Vec<Arc<dyn ObstacleShape>>); 4] = [
         ("plane", vec![ground.clone()]),
         ("edge", vec![ground.clone(), Arc::new(edge)]),
         ("ball", vec![ground.clone(), Arc::new(Sphere { center: [0.06, -0.3, 0.04], radius: 0.3 })]),
@@ -325,7 +325,7 @@ fn no_contact_ever_adds_energy() {
 fn an_obstacle_that_is_no_number_is_refused() {
     #[derive(Debug)]
     struct Broken;
-    impl Obstacle for Broken {
+    impl ObstacleShape for Broken {
         fn at(&self, _: &Vector3<f64>) -> SurfacePoint {
             SurfacePoint { distance: f64::NAN, normal: Vector3::y() }
         }

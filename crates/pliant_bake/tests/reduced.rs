@@ -175,7 +175,7 @@ fn a_bar_hangs_as_the_full_solution_does() {
 
 /// Lets a held bar go and returns its free motion: the path of a patch along `axis` and the
 /// energies.
-fn let_go(
+fn released(
     model: &Arc<ModalModel>,
     way: [f64; 3],
     axis: usize,
@@ -220,8 +220,8 @@ fn a_body_that_was_let_go_rings_on_at_its_frequency_and_gains_nothing() {
     for (way, axis, small) in
         [([0.0, 0.01, 0.0], 1, true), ([0.01, 0.0, 0.0], 0, true), ([0.0, 0.4, 0.0], 1, false)]
     {
-        let (path, energy) = let_go(&model, way, axis, step, 5.0);
-        let (fine, _) = let_go(&model, way, axis, step / 8.0, 5.0);
+        let (path, energy) = released(&model, way, axis, step, 5.0);
+        let (fine, _) = released(&model, way, axis, step / 8.0, 5.0);
         let (hz, fine) = (frequency(&path, step), frequency(&fine, step / 8.0));
         let most = energy.iter().fold(0.0f64, |most, e| most.max(*e)) / energy[0];
         let lost = 1.0 - (energy[energy.len() - 1] / energy[0]).sqrt();
@@ -339,7 +339,7 @@ fn dead_loads_agree_too_and_a_model_without_material_stays_linear() {
 fn what_a_material_does_not_bear_is_refused_by_name() {
     let mesh = shapes::bar([2, 1, 1], [0.4, 0.1, 0.1]).unwrap();
     let refused = |config: BakeConfig| bake(&mesh, None, &config, &mut |_, _| ()).unwrap_err().to_string();
-    let most = BakeConfig::MOST_COORDINATES;
+    let most = BakeConfig::MAX_COORDINATES;
     let many = refused(BakeConfig { modes: most + 1, ..config(1) });
     assert!(many.contains("modes") && many.contains("120") && most == 120, "{many}");
     let locking = refused(BakeConfig { poisson: 0.49, ..config(9) });

@@ -319,11 +319,11 @@ impl BodyState {
     ///
     /// The function allocates and suits occasional queries such as a click. The drawn surface is
     /// computed by a faster path.
-    pub fn positions(&self, shown: &VisualState) -> Vec<[f32; 3]> {
+    pub fn positions(&self, visual: &VisualState) -> Vec<[f32; 3]> {
         let mut q = Vec::new();
-        shown.draw(&mut q);
+        visual.draw(&mut q);
         let mut positions = self.positions_at(&q);
-        if let Some((shapes, s)) = shown.held() {
+        if let Some((shapes, s)) = visual.held() {
             shapes.add_to(s, &mut positions);
         }
         positions

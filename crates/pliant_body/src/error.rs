@@ -9,7 +9,7 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum BodyError {
     /// The target of a grab is NaN or infinite.
-    #[error("the target of a grab must be finite metres, got {target:?}; it keeps its last good one")]
+    #[error("the target of a grab must be finite meters, got {target:?}; it keeps its last good one")]
     TargetNotFinite {
         /// The refused target, m.
         target: [f64; 3],

@@ -23,11 +23,11 @@ pub struct HeldShapesCache {
 }
 
 /// The number of entries that are kept. One takes up to about a megabyte.
-const MOST: usize = 32;
+const MAX: usize = 32;
 
 /// The number of entries that are made at a time. Whoever grabs one patch after another occupies no
 /// more of the compute threads, and bodies that wait are served later.
-const MOST_MAKING: usize = 4;
+const MAX_MAKING: usize = 4;
 
 struct Entry {
     model: ModelHash,
@@ -51,7 +51,7 @@ impl HeldShapesCache {
         patches: &[(u32, f64)],
     ) -> Option<Option<Arc<HeldShapes>>> {
         let has_mesh = model.parts().reduced.as_ref().is_some_and(|reduced| reduced.mesh.is_some());
-        if patches.is_empty() || patches.len() > HeldShapes::MOST_PATCHES || !has_mesh {
+        if patches.is_empty() || patches.len() > HeldShapes::MAX_PATCHES || !has_mesh {
             return Some(None);
         }
         let key: Vec<(u32, u64)> = patches.iter().map(|(v, radius)| (*v, radius.to_bits())).collect();
@@ -65,14 +65,14 @@ impl HeldShapesCache {
         let is_made = |entry: &Entry| matches!(entry.shapes, Making::Done(_));
         let entry = match self.entries.iter().position(|e| e.model == model.hash() && e.patches == key) {
             Some(index) => self.entries.remove(index),
-            None if self.entries.iter().filter(|e| !is_made(e)).count() >= MOST_MAKING => return None,
+            None if self.entries.iter().filter(|e| !is_made(e)).count() >= MAX_MAKING => return None,
             None => Entry { model: model.hash(), shapes: begin(model, patches), patches: key },
         };
         let result = match &entry.shapes {
             Making::Done(shapes) => Some(shapes.clone()),
             Making::Task(_) => None,
         };
-        if self.entries.len() >= MOST
+        if self.entries.len() >= MAX
             && let Some(oldest) = self.entries.iter().position(is_made)
         {
             self.entries.remove(oldest);
@@ -84,14 +84,14 @@ impl HeldShapesCache {
     /// Returns the shapes that a body should change to, if it should change.
     ///
     /// `patches` are those that hands hold, in any order; no more than
-    /// [`HeldShapes::MOST_PATCHES`] of them get shapes. `own` are the shapes that the body has.
+    /// [`HeldShapes::MAX_PATCHES`] of them get shapes. `own` are the shapes that the body has.
     pub fn change(
         &mut self,
         model: &Arc<ModalModel>,
         patches: impl IntoIterator<Item = (u32, f64)>,
         own: Option<&Arc<HeldShapes>>,
     ) -> Option<Option<Arc<HeldShapes>>> {
-        let mut patches: Vec<(u32, f64)> = patches.into_iter().take(HeldShapes::MOST_PATCHES).collect();
+        let mut patches: Vec<(u32, f64)> = patches.into_iter().take(HeldShapes::MAX_PATCHES).collect();
         // Equal sets of patches share their shapes.
         patches.sort_unstable_by_key(|&(vertex, radius)| (vertex, radius.to_bits()));
         patches.dedup();

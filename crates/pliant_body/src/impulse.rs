@@ -56,7 +56,7 @@ pub struct Push {
 
 /// Passes the tick's impulses and forces to the solver, in the order in which they were written.
 pub(crate) fn hit_bodies(
-    mut strikes: MessageReader<Impulse>,
+    mut impulses: MessageReader<Impulse>,
     mut pushes: MessageReader<Push>,
     mut refusals: Refusals,
     mut bodies: Query<(NameOrEntity, &Driven, &mut BodyState)>,
@@ -75,7 +75,7 @@ pub(crate) fn hit_bodies(
             Err(error) => refusals.report(&name, entity, BodyError::Impulse(error)),
         }
     };
-    for &Impulse { body, vertex, impulse } in strikes.read() {
+    for &Impulse { body, vertex, impulse } in impulses.read() {
         hit(body, &|body, scale| body.apply_impulse(vertex, (impulse / scale).into()));
     }
     for &Push { body, vertex, force } in pushes.read() {

@@ -199,7 +199,7 @@ impl Plugin for PliantBodyPlugin {
             .register_diagnostic(Diagnostic::new(AWAKE_BODIES))
             .register_diagnostic(Diagnostic::new(DEFORM_TIME).with_suffix(" ms"))
             .add_observer(step::drop_states)
-            .add_observer(step::let_go)
+            .add_observer(step::clear_grab_force)
             .add_observer(step::lose_body)
             .configure_sets(
                 self.schedule,

@@ -23,7 +23,7 @@ use bevy::prelude::*;
 /// Pausing `Time<Virtual>` is enough to pause the bodies: no tick is counted, no body is stepped
 /// and no surface is written. Targets that move during the pause take effect in the next step. A
 /// single step runs the whole fixed loop once, together with the game's own systems in it. While
-/// time runs, the message has no effect and is dropped. A frame runs at most [`SingleSteps::MOST`]
+/// time runs, the message has no effect and is dropped. A frame runs at most [`SingleSteps::MAX`]
 /// steps.
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
 #[reflect(Clone, PartialEq)]
@@ -31,7 +31,7 @@ pub struct SingleSteps(pub u32);
 
 impl SingleSteps {
     /// Maximum number of steps in one frame.
-    pub const MOST: u32 = 1_000;
+    pub const MAX: u32 = 1_000;
 }
 
 pub(crate) fn single_steps(
@@ -42,7 +42,7 @@ pub(crate) fn single_steps(
     let steps = messages.read().fold(0_u32, |sum, steps| sum.saturating_add(steps.0));
     let (Some(time), Some(mut fixed)) = (time, fixed) else { return };
     if steps > 0 && time.is_paused() {
-        let passed = fixed.timestep().saturating_mul(steps.min(SingleSteps::MOST));
+        let passed = fixed.timestep().saturating_mul(steps.min(SingleSteps::MAX));
         fixed.accumulate_overstep(passed);
     }
 }

@@ -95,11 +95,11 @@ pub(crate) fn build_bodies(
                             Some(old) if Arc::ptr_eq(old.model(), model) => carry_over(&name, &old.body, new),
                             _ => new,
                         };
-                        let shown = VisualState::new(new.q());
+                        let visual = VisualState::new(new.q());
                         // The entity may have been despawned in this frame.
                         commands
                             .entity(name.entity)
-                            .try_insert((BodyState::new(new), shown))
+                            .try_insert((BodyState::new(new), visual))
                             .try_remove::<BuildRefused>();
                     }
                     Err(error) => {
@@ -143,7 +143,7 @@ pub(crate) fn drop_states(removed: On<Remove, ModalBody>, mut commands: Commands
 }
 
 /// Sets the force of a grab that was removed from its body to zero.
-pub(crate) fn let_go(removed: On<Remove, GrabOf>, mut forces: Query<&mut GrabForce>) {
+pub(crate) fn clear_grab_force(removed: On<Remove, GrabOf>, mut forces: Query<&mut GrabForce>) {
     feel_nothing(removed.entity, &mut forces);
 }
 
@@ -176,7 +176,7 @@ pub(crate) fn place_bodies(
         With<ModalBody>,
     >,
 ) {
-    for (name, local, global, mut state, mut shown) in &mut bodies {
+    for (name, local, global, mut state, mut visual) in &mut bodies {
         // A free body has no parent. Its `GlobalTransform` does not contain the changes to
         // `Transform` since the last frame.
         let transform = if state.model().is_free() { GlobalTransform::from(*local) } else { *global };
@@ -210,7 +210,7 @@ pub(crate) fn place_bodies(
         let rotation = rotation.as_dquat().normalize();
         match state.body_mut().set_pose(origin.into(), rotation.into()) {
             // The body jumped to this pose, so the visual state must not interpolate toward it.
-            Ok(()) => shown.bypass_change_detection().forget_pose(),
+            Ok(()) => visual.bypass_change_detection().forget_pose(),
             Err(error) => refusals.report(&name, name.entity, BodyError::Step(error)),
         }
     }
@@ -245,7 +245,7 @@ pub(crate) fn hold_bodies(
             }
             stays
         });
-        let let_go = body.grabs().count() < before;
+        let released = body.grabs().count() < before;
         for &entity in wanted {
             let Ok((name, grab)) = grabs.get(entity) else { continue };
             let known = held.iter().position(|held| held.entity == entity);
@@ -270,7 +270,7 @@ pub(crate) fn hold_bodies(
         }
         // A grab keeps the body awake. A release wakes the body until it comes to rest. A refused
         // grab has no effect.
-        if let_go || held.iter().any(|held| held.id.is_some()) {
+        if released || held.iter().any(|held| held.id.is_some()) {
             (*quiet, *resting) = (0.0, false);
         }
     }
@@ -418,7 +418,7 @@ pub(crate) fn publish(
     mut bodies: Query<(NameOrEntity, &BodyState, &mut VisualState)>,
     mut forces: Query<&mut GrabForce>,
 ) {
-    for (name, state, mut shown) in &mut bodies {
+    for (name, state, mut visual) in &mut bodies {
         if !state.stepped {
             continue;
         }
@@ -429,14 +429,14 @@ pub(crate) fn publish(
                 origin: DVec3::from(frame.origin()) * state.scale,
                 orientation: DQuat::from_array(frame.orientation()),
             };
-            shown.push_at(body.q(), pose)
+            visual.push_at(body.q(), pose)
         } else {
-            shown.push(body.q())
+            visual.push(body.q())
         };
         if let Err(error) = pushed {
             warn!("{name}: a step was not shown: {error}");
         }
-        shown.hold(body.held_shapes().map(|shapes| (shapes, &body.state().s[..])));
+        visual.hold(body.held_shapes().map(|shapes| (shapes, &body.state().s[..])));
         for held in &state.held {
             let Ok(mut force) = forces.get_mut(held.entity) else { continue };
             let grab_force = held.id.and_then(|id| {

@@ -37,7 +37,7 @@ pub struct VisualState {
     #[reflect(ignore)]
     current: Vec<f64>,
     #[reflect(ignore)]
-    shown: Vec<f64>,
+    displayed: Vec<f64>,
     /// Ticks since the last push: 0 in the tick of the push.
     age: u8,
     shows_newest: bool,
@@ -56,7 +56,7 @@ struct HeldColumns {
     shapes: Arc<HeldShapes>,
     previous: Vec<f64>,
     current: Vec<f64>,
-    shown: Vec<f64>,
+    displayed: Vec<f64>,
     /// Whether the body has them no more. They then end when the picture is at the newest state.
     ends: bool,
 }
@@ -66,7 +66,7 @@ impl VisualState {
         Self {
             previous: q.to_vec(),
             current: q.to_vec(),
-            shown: q.to_vec(),
+            displayed: q.to_vec(),
             age: 1,
             shows_newest: true,
             at: None,
@@ -107,7 +107,7 @@ impl VisualState {
         self.check(q)?;
         self.previous.copy_from_slice(q);
         self.current.copy_from_slice(q);
-        self.shown.copy_from_slice(q);
+        self.displayed.copy_from_slice(q);
         self.age = 1;
         self.shows_newest = true;
         self.version += 1;
@@ -147,8 +147,8 @@ impl VisualState {
             (Some((shapes, s)), held) => {
                 // Shapes of other patches go on from where the old ones were.
                 let from = if held.is_some() { s.to_vec() } else { vec![0.0; s.len()] };
-                let (shapes, current, shown) = (shapes.clone(), s.to_vec(), from.clone());
-                *held = Some(HeldColumns { shapes, previous: from, current, shown, ends: false });
+                let (shapes, current, displayed) = (shapes.clone(), s.to_vec(), from.clone());
+                *held = Some(HeldColumns { shapes, previous: from, current, displayed, ends: false });
             }
             // They fade over one tick.
             (None, Some(held)) if !held.ends => {
@@ -162,7 +162,7 @@ impl VisualState {
             && let Some(held) = &mut self.held
         {
             held.previous.copy_from_slice(&held.current);
-            held.shown.copy_from_slice(&held.current);
+            held.displayed.copy_from_slice(&held.current);
             if held.ends {
                 self.held = None;
             }
@@ -171,7 +171,7 @@ impl VisualState {
 
     /// The own shapes of held patches in the state on screen, and their coordinates.
     pub fn held(&self) -> Option<(&Arc<HeldShapes>, &[f64])> {
-        self.held.as_ref().map(|held| (&held.shapes, &held.shown[..]))
+        self.held.as_ref().map(|held| (&held.shapes, &held.displayed[..]))
     }
 
     /// Writes the coordinates with which the model draws the state on screen. They are
@@ -179,7 +179,7 @@ impl VisualState {
     /// then have to be added to the surface ([`HeldShapes::add_to`]).
     pub fn draw(&self, q: &mut Vec<f64>) {
         q.clear();
-        q.extend_from_slice(&self.shown);
+        q.extend_from_slice(&self.displayed);
         if let Some((shapes, s)) = self.held() {
             shapes.draw(s, q);
         }
@@ -187,7 +187,7 @@ impl VisualState {
 
     /// Returns the state on screen in this frame: one coordinate per kept mode, kg^1/2 m.
     pub fn q(&self) -> &[f64] {
-        &self.shown
+        &self.displayed
     }
 
     /// Returns the newest pushed state: one coordinate per kept mode, kg^1/2 m.
@@ -249,12 +249,12 @@ impl VisualState {
 
     fn interpolate(&mut self, fraction: f64) {
         self.at = Some(fraction);
-        for ((shown, a), b) in self.shown.iter_mut().zip(&self.previous).zip(&self.current) {
-            *shown = a + (b - a) * fraction;
+        for ((displayed, a), b) in self.displayed.iter_mut().zip(&self.previous).zip(&self.current) {
+            *displayed = a + (b - a) * fraction;
         }
         if let Some(held) = &mut self.held {
-            for ((shown, a), b) in held.shown.iter_mut().zip(&held.previous).zip(&held.current) {
-                *shown = a + (b - a) * fraction;
+            for ((displayed, a), b) in held.displayed.iter_mut().zip(&held.previous).zip(&held.current) {
+                *displayed = a + (b - a) * fraction;
             }
         }
         self.version += 1;
@@ -284,12 +284,12 @@ pub(crate) fn interpolate(
         // With one step per frame, the newest state belongs to this frame.
         _ => 1.0,
     };
-    for (mut shown, mut state, mut transform) in &mut bodies {
-        if !shown.is_behind(fraction) {
+    for (mut displayed, mut state, mut transform) in &mut bodies {
+        if !displayed.is_behind(fraction) {
             continue;
         }
-        shown.interpolate(fraction);
-        if let Some([from, to]) = shown.poses
+        displayed.interpolate(fraction);
+        if let Some([from, to]) = displayed.poses
             // If the transform was changed from outside, the next tick applies that change instead.
             && state.is_placed(&transform.compute_affine())
         {

@@ -3,7 +3,7 @@
 use std::{path::PathBuf, sync::Arc};
 
 use clap::Args;
-use pliant_lab::drop::{Drop, Dropped, Onto, Tick, drop};
+use pliant_lab::drop::{Drop, DropTick, Dropped, Onto, drop};
 use pliant_modal::{Elasticity, ModalModel};
 
 use crate::arguments::elasticity;
@@ -88,7 +88,7 @@ pub(crate) fn run(args: &DropArgs) -> Result<(), CliError> {
 }
 
 fn text(dropped: &Dropped) -> String {
-    let total = |tick: &Tick| tick.kinetic + tick.elastic + tick.potential;
+    let total = |tick: &DropTick| tick.kinetic + tick.elastic + tick.potential;
     let ticks = &dropped.ticks;
     let mut out = "    time    center x, y, z (m)                force x, y, z (N)              contacts  \
                    penetration (m)  energy (J)\n"

@@ -7,7 +7,7 @@
 //! loses packets:
 //!
 //! ```sh
-//! pliant mesh bar --cells 8,2,2 --size 1,0.2,0.2 -o bar.msh                  # a metre of tetrahedra
+//! pliant mesh bar --cells 8,2,2 --size 1,0.2,0.2 -o bar.msh                  # a meter of tetrahedra
 //! pliant bake bar.msh --modes 12 --young 1e5 --anchor 'x<0.01' -o bar.modal   # held at one end
 //! pliant inspect bar.modal                                                   # its modes, and how exact they are
 //! pliant bench step bar.modal                                                # what it costs here

@@ -114,7 +114,7 @@ pub(crate) struct Nearby {
 #[derive(Debug)]
 struct Nothing;
 
-impl modal::Obstacle for Nothing {
+impl modal::ObstacleShape for Nothing {
     fn at(&self, _: &Vector3<f64>) -> modal::SurfacePoint {
         modal::SurfacePoint { distance: 1e30, normal: Vector3::y() }
     }

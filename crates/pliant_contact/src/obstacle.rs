@@ -158,7 +158,7 @@ impl Motion {
     }
 
     /// The obstacle in the world of a body on an entity of uniform scale `scale`.
-    pub(crate) fn obstacle(&self, scale: f64) -> Arc<dyn modal::Obstacle> {
+    pub(crate) fn obstacle(&self, scale: f64) -> Arc<dyn modal::ObstacleShape> {
         self.visit(scale, Share)
     }
 
@@ -171,16 +171,16 @@ impl Motion {
 /// What is done with an obstacle of any shape.
 trait Visit {
     type Output;
-    fn visit(self, obstacle: impl modal::Obstacle + 'static) -> Self::Output;
+    fn visit(self, obstacle: impl modal::ObstacleShape + 'static) -> Self::Output;
 }
 
 /// Makes an obstacle that bodies can share.
 struct Share;
 
 impl Visit for Share {
-    type Output = Arc<dyn modal::Obstacle>;
+    type Output = Arc<dyn modal::ObstacleShape>;
 
-    fn visit(self, obstacle: impl modal::Obstacle + 'static) -> Self::Output {
+    fn visit(self, obstacle: impl modal::ObstacleShape + 'static) -> Self::Output {
         Arc::new(obstacle)
     }
 }
@@ -191,7 +191,7 @@ struct Distance<'a>(&'a Vector3<f64>);
 impl Visit for Distance<'_> {
     type Output = f64;
 
-    fn visit(self, obstacle: impl modal::Obstacle + 'static) -> f64 {
+    fn visit(self, obstacle: impl modal::ObstacleShape + 'static) -> f64 {
         obstacle.at(self.0).distance
     }
 }

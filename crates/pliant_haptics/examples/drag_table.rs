@@ -14,7 +14,7 @@ mod rig;
 
 use std::{process::ExitCode, sync::Arc};
 
-use pliant_haptics::{Hand, VirtualConfig};
+use pliant_haptics::{HandModel, VirtualConfig};
 use pliant_modal::ModalModel;
 use rig::scene::{SceneConfig, Subject, drag};
 
@@ -57,7 +57,7 @@ fn main() -> ExitCode {
     let (mut bad, mut worst) = (0, [0.0f64; 3]);
     for round_trip in [0.0, 0.196] {
         let mut of_trip = [0.0f64; 3];
-        for (grip, hand) in Hand::PRESETS {
+        for (grip, hand) in HandModel::PRESETS {
             if !summary {
                 println!(
                     "\n{name}, {}, {kind} model, hand {grip}, round trip {:.0} ms:\n",

@@ -7,10 +7,10 @@
 //! [`Safety`] pipeline before the device applies the force to the hand.
 //!
 //! ```
-//! use pliant_haptics::{Hand, HapticLoop, LoopConfig, VirtualDevice, VirtualConfig};
+//! use pliant_haptics::{HandModel, HapticLoop, LoopConfig, VirtualDevice, VirtualConfig};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM)?;
+//! let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM)?;
 //! let mut running = HapticLoop::start(device, LoopConfig::default())?;
 //! println!("{}", running.coupling());
 //! let stamp = running.report().tick.now;
@@ -57,19 +57,19 @@ mod safety;
 #[cfg(feature = "vendor")]
 mod vendor;
 
-pub use control_loop::core::{LoopConfig, LoopCore, StartError, Tick};
+pub use control_loop::core::{LoopConfig, LoopCore, LoopTick, StartError};
 pub use control_loop::coupling::{Coupling, CouplingConfig, CouplingLimit};
 pub use control_loop::cycle::{Cycle, LoopEvent, LoopReport, LoopState, Record, Sink};
 pub use control_loop::histogram::Histogram;
 pub use control_loop::local_body::ModalLocal;
 pub use control_loop::local_model::{
-    Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter, PublishedGrab,
+    HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter, PublishedGrab, ToolContact,
 };
 pub use control_loop::runner::{HapticLoop, StopSwitch};
 pub use control_loop::scheduler::{LoopClock, RealScheduler, VirtualScheduler};
 pub use control_loop::tool::ToolMap;
 pub use device::find::{FindConfig, Found, OpenError, find_devices};
-pub use device::hand::Hand;
+pub use device::hand::HandModel;
 #[cfg(feature = "inverse")]
 pub use device::inverse::{Inverse, InverseConfig, InverseError, Spelling};
 pub use device::positioned::{Positioned, PositionedHandle};

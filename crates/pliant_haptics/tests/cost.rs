@@ -12,7 +12,7 @@ use std::{
     time::Duration,
 };
 
-use pliant_haptics::{Hand, HapticLoop, Histogram, LoopEvent, LoopState, VirtualConfig, VirtualDevice};
+use pliant_haptics::{HandModel, HapticLoop, Histogram, LoopEvent, LoopState, VirtualConfig, VirtualDevice};
 use rig::{
     machine,
     scene::{Scene, SceneConfig},
@@ -67,7 +67,7 @@ const ROUNDS: usize = 10;
 /// The function lowers `least`, the work time of each period including the simulated device, s, and
 /// `yardstick`, the time of [`multiply_and_add`], s.
 fn ticks(modal: bool, least: &mut [f64], yardstick: &mut f64) -> u64 {
-    let mut scene = Scene::new(SceneConfig { modal, hand: Hand::LIGHT, ..SceneConfig::default() });
+    let mut scene = Scene::new(SceneConfig { modal, hand: HandModel::LIGHT, ..SceneConfig::default() });
     scene.hand.set_target([0.01, 0.01, 0.0]);
     scene.run(0.2);
     let mut events = Vec::with_capacity(1024);
@@ -140,7 +140,7 @@ fn the_modal_loop_allocates_nothing_and_takes_as_long_as_sixty_thousand() {
 
 #[test]
 fn on_its_own_thread() {
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let hand = device.handle();
     hand.set_target([0.01, 0.0, 0.0]);
     let mut running = HapticLoop::start(device, machine::patient()).unwrap();

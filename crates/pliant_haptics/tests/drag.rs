@@ -6,7 +6,7 @@ mod rig;
 
 use std::sync::Arc;
 
-use pliant_haptics::{Coupling, CouplingConfig, Hand, VirtualConfig};
+use pliant_haptics::{Coupling, CouplingConfig, HandModel, VirtualConfig};
 use rig::{
     baked,
     scene::{Drag, SceneConfig, Subject, drag},
@@ -49,7 +49,7 @@ fn what_counts_as_calm() {
 fn dragging_near_is_calm() {
     for young in [1e3, 1e5, 1e11] {
         for simulation in [40.0, 240.0] {
-            for hand in [Hand::FIRM, Hand::LOOSE, Hand::NONE] {
+            for hand in [HandModel::FIRM, HandModel::LOOSE, HandModel::NONE] {
                 holds(SceneConfig { young, simulation, hand, modes: 12, ..SceneConfig::default() });
             }
         }
@@ -60,7 +60,7 @@ fn dragging_near_is_calm() {
 fn dragging_over_a_network_is_calm() {
     for modal in [false, true] {
         for young in [1e3, 1e5] {
-            for hand in [Hand::LIGHT, Hand::NONE] {
+            for hand in [HandModel::LIGHT, HandModel::NONE] {
                 holds(SceneConfig {
                     young,
                     hand,
@@ -81,7 +81,7 @@ fn without_friction_it_is_calm_too() {
         holds(SceneConfig {
             young: 1e5,
             device,
-            hand: Hand::LOOSE,
+            hand: HandModel::LOOSE,
             modal,
             modes: 12,
             ..SceneConfig::default()
@@ -93,7 +93,7 @@ fn without_friction_it_is_calm_too() {
 fn a_baked_body_is_calm_in_every_hand() {
     let pip = Subject::Baked(Arc::new(baked::pip()));
     for round_trip in [0.0, 0.196] {
-        for (_, hand) in Hand::PRESETS {
+        for (_, hand) in HandModel::PRESETS {
             for (young, simulation, modal) in [
                 (1e3, 40.0, false),
                 (1e3, 1000.0, true),
@@ -149,10 +149,10 @@ fn the_hand_feels_the_body() {
     // 1e4 Pa the block has E A / L = 160 N/m, the arm 150 N/m, and the coupling what the clamp
     // leaves. The drag is 30 mm long.
     for modal in [false, true] {
-        let d = holds(SceneConfig { young: 1e4, hand: Hand::LIGHT, modal, ..SceneConfig::default() });
+        let d = holds(SceneConfig { young: 1e4, hand: HandModel::LIGHT, modal, ..SceneConfig::default() });
         let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
         let free =
-            drag(SceneConfig { young: 1e4, hand: Hand::LIGHT, modal, device, ..SceneConfig::default() });
+            drag(SceneConfig { young: 1e4, hand: HandModel::LIGHT, modal, device, ..SceneConfig::default() });
         let coupling = 0.7 * 400.0;
         let want = 0.03 / (1.0 / 160.0 + 1.0 / 150.0 + 1.0 / coupling);
         // The thermal budget limits a force above the permanent 0.88 N only after seconds.
@@ -167,10 +167,10 @@ fn a_slow_loop_and_a_fast_one() {
     for rate in [500.0, 8000.0] {
         for modal in [false, true] {
             for (young, hand, simulation) in [
-                (1e3, Hand::LOOSE, 40.0),
-                (1e5, Hand::LIGHT, 120.0),
-                (1e5, Hand::NONE, 240.0),
-                (1e11, Hand::FIRM, 120.0),
+                (1e3, HandModel::LOOSE, 40.0),
+                (1e5, HandModel::LIGHT, 120.0),
+                (1e5, HandModel::NONE, 240.0),
+                (1e11, HandModel::FIRM, 120.0),
             ] {
                 holds(SceneConfig {
                     young,
@@ -187,7 +187,7 @@ fn a_slow_loop_and_a_fast_one() {
             let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
             let coupling =
                 Coupling::clamp(&CouplingConfig::default(), &device.info(), rate, 0.0, 0.0).stiffness;
-            let hand = Hand::LIGHT;
+            let hand = HandModel::LIGHT;
             let d = holds(SceneConfig { young: 1e4, hand, device, rate, modal, ..SceneConfig::default() });
             let want = 0.03 / (1.0 / 160.0 + 1.0 / 150.0 + 1.0 / coupling);
             assert!((d.force / want - 1.0).abs() < 0.03, "{rate} Hz: {} N for {want} N", d.force);

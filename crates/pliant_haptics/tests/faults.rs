@@ -14,9 +14,9 @@ use std::{
 };
 
 use pliant_haptics::{
-    Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport,
-    LoopState, PassivityConfig, SafetyConfig, SafetyError, Sample, Scheduler, StaleConfig, StartError,
-    ThermalConfig, VelocityCutConfig, VirtualConfig, VirtualDevice, VirtualScheduler, Wrench,
+    Calibration, Cycle, DeviceInfo, Fault, HandModel, HapticDevice, HapticLoop, LoopConfig, LoopEvent,
+    LoopReport, LoopState, PassivityConfig, SafetyConfig, SafetyError, Sample, Scheduler, StaleConfig,
+    StartError, ThermalConfig, VelocityCutConfig, VirtualConfig, VirtualDevice, VirtualScheduler, Wrench,
 };
 use rig::{
     Rig, machine,
@@ -26,7 +26,7 @@ use rig::{
 /// Creates a scene in which a firm hand has dragged the block 2 cm to the side and holds it there.
 fn holding() -> Scene {
     let mut scene =
-        Scene::new(SceneConfig { young: 1e5, modes: 12, hand: Hand::FIRM, ..SceneConfig::default() });
+        Scene::new(SceneConfig { young: 1e5, modes: 12, hand: HandModel::FIRM, ..SceneConfig::default() });
     scene.run(0.4);
     for k in 1..=200 {
         scene.hand.set_target([0.02 * f64::from(k) / 200.0, 0.0, 0.0]);
@@ -143,7 +143,7 @@ impl HapticDevice for At {
 fn after(change: impl FnOnce(&mut Sample, &mut VirtualScheduler)) -> ([f64; 3], Cycle<At>) {
     let hand = Arc::new(Mutex::new(Sample { sequence: Some(0), ..Sample::at([0.005, 0.0, 0.0]) }));
     let mut cycle = Cycle::new(At(hand.clone()), LoopConfig::default()).unwrap();
-    let mut rig = Rig::bare(VirtualConfig::default(), Hand::NONE);
+    let mut rig = Rig::bare(VirtualConfig::default(), HandModel::NONE);
     let mut scheduler = VirtualScheduler::new(1000.0);
     let mut change = Some(change);
     let (mut before, mut peak, mut rise, mut last) = (0.0, 0.0f64, 0.0f64, 0.0);
@@ -274,12 +274,12 @@ impl HapticDevice for Liar {
 /// Runs a spring of 200 N/m that a firm hand stretches by 1 cm, with `lie` for `ticks` periods and
 /// without it before and after.
 fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let hand = device.handle();
     hand.set_target([0.014, 0.0, 0.0]);
     let mut cycle =
         Cycle::new(Liar { inner: device, lie: Cell::new(Lie::None) }, LoopConfig::default()).unwrap();
-    let mut rig = Rig::bare(VirtualConfig::default(), Hand::NONE);
+    let mut rig = Rig::bare(VirtualConfig::default(), HandModel::NONE);
     let mut scheduler = VirtualScheduler::new(1000.0);
     let mut events = Vec::new();
     let (mut last, mut step) = ([0.0f64; 3], 0.0f64);
@@ -324,7 +324,7 @@ fn a_velocity_that_overflows() {
 }
 
 #[test]
-fn a_jump_of_a_metre() {
+fn a_jump_of_a_meter() {
     let (cycle, events, lowest, step) = told(Lie::Elsewhere, 500);
     assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Jump(d)) if (d - 1.0).abs() < 0.01)));
     assert!(lowest < 1e-9);
@@ -356,7 +356,7 @@ fn a_driver_that_fails_each_tick() {
 
 #[test]
 fn a_real_device_is_not_run_without_its_safety() {
-    let real = || Real(VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap());
+    let real = || Real(VirtualDevice::new(VirtualConfig::touch(), HandModel::NONE).unwrap());
     let bare = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
     let refused = Cycle::new(real(), bare).err();
     assert!(
@@ -385,7 +385,7 @@ impl HapticDevice for Real {
 
 #[test]
 fn limits_that_limit_nothing_are_refused() {
-    let real = || Real(VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap());
+    let real = || Real(VirtualDevice::new(VirtualConfig::touch(), HandModel::NONE).unwrap());
     let full = SafetyConfig::for_device(&real().info(), 1000.0);
     let changes: [(&str, fn(&mut SafetyConfig)); 16] = [
         ("slew", |s| s.slew = Some(1e300)),
@@ -450,7 +450,7 @@ impl HapticDevice for Bomb {
 #[test]
 fn a_driver_that_panics() {
     for twice in [false, true] {
-        let inner = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+        let inner = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
         let hand = inner.handle();
         hand.set_target([0.014, 0.0, 0.0]);
         let (panic, stopped) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU32::new(0)));

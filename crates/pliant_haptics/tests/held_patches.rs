@@ -10,16 +10,16 @@ use std::sync::{
 };
 
 use pliant_haptics::{
-    Contact, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore, LoopEvent,
-    LoopState, ModalLocal, SafetyConfig, Sample, Scheduler, VirtualConfig, VirtualDevice, VirtualScheduler,
-    Wrench,
+    Cycle, DeviceInfo, Fault, HandModel, HapticDevice, LocalModel, LoopConfig, LoopCore, LoopEvent,
+    LoopState, ModalLocal, SafetyConfig, Sample, Scheduler, ToolContact, VirtualConfig, VirtualDevice,
+    VirtualScheduler, Wrench,
 };
 use pliant_modal::{BodyConfig, StepSettings};
 use rig::scene::{Scene, SceneConfig};
 
 /// Creates a scene in which a firm hand has dragged the block to the side and holds it there.
 fn holding(modal: bool, pull: f64) -> Scene {
-    let hand = Hand::FIRM;
+    let hand = HandModel::FIRM;
     let mut scene = Scene::new(SceneConfig { young: 1e5, modes: 12, hand, modal, ..SceneConfig::default() });
     scene.run(0.4);
     for k in 1..=200 {
@@ -81,13 +81,18 @@ fn a_stiffer_body_is_felt_as_one_little_by_little() {
     assert!(scene.largest_step < 0.25 * slew * 1e-3, "a step of {} N", scene.largest_step);
 }
 
-fn spring(key: u64, proxy: [f64; 3], k: f64) -> Contact {
-    Contact { key, proxy, stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() }
+fn spring(key: u64, proxy: [f64; 3], k: f64) -> ToolContact {
+    ToolContact {
+        key,
+        proxy,
+        stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
+        ..ToolContact::default()
+    }
 }
 
 /// Runs a hand at rest for `ticks` periods with `contacts`, at 100 local model updates per second.
 /// Returns the force along x at the end and its largest change in a tick, N.
-fn told(core: &mut LoopCore, word: &mut LocalModel, contacts: &[Contact], ticks: u64) -> [f64; 2] {
+fn told(core: &mut LoopCore, word: &mut LocalModel, contacts: &[ToolContact], ticks: u64) -> [f64; 2] {
     word.count = contacts.len();
     word.contacts[..contacts.len()].copy_from_slice(contacts);
     let mut step = 0.0f64;
@@ -162,7 +167,7 @@ impl HapticDevice for Changeling {
 fn another_device_gets_the_copy_or_it_is_handed_back() {
     let scene = holding(true, 0.01);
     for (which, gets_it) in [(0, true), (1, true), (2, false)] {
-        let inner = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+        let inner = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
         let (hand, now) = (inner.handle(), Arc::new(AtomicU32::new(0)));
         let device = Changeling { inner, which: now.clone() };
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();

@@ -10,8 +10,9 @@ use bevy::{
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin};
 
 use pliant_haptics::{
-    DeviceId, Fault, Hand, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool, HapticsPlugin,
-    HeldBy, LoopConfig, LoopState, ToolGrip, ToolPose, VirtualConfig, VirtualDevice, VirtualHandle,
+    DeviceId, Fault, HandModel, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool,
+    HapticsPlugin, HeldBy, LoopConfig, LoopState, ToolGrip, ToolPose, VirtualConfig, VirtualDevice,
+    VirtualHandle,
 };
 
 #[path = "rig/block.rs"]
@@ -73,7 +74,7 @@ fn scene_in(mut app: App, modal: bool, uneven: bool) -> Scene {
 
 /// Adds a virtual device with a firm hand at rest.
 fn add_device(app: &mut App) -> (DeviceId, VirtualHandle) {
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let hand = device.handle();
     (app.world_mut().resource_mut::<HapticDevices>().add(device, machine::patient()).unwrap(), hand)
 }
@@ -373,7 +374,7 @@ fn two_devices_on_one_body_feel_each_other() {
     // One hand drags the block. The other hand holds still and is pulled along: its force is
     // opposite, less the part that the block's own 1600 N/m takes.
     s.hand.set_target([0.02, 0.0, 0.0]);
-    until(&mut s, "the still hand is pulled towards the one that pulls", |s| {
+    until(&mut s, "the still hand is pulled toward the one that pulls", |s| {
         let [puller, holder] = devices(s);
         puller.x < -1.0 && holder.x > 0.2
     });
@@ -428,7 +429,7 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     let mut s = scene(false);
     let at = *s.app.world().get::<Transform>(s.tool).unwrap();
     s.app.world_mut().despawn(s.tool);
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let (hand, fuse) = (device.handle(), std::sync::Arc::default());
     let bomb = Bomb(device, std::sync::Arc::clone(&fuse));
     s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(bomb, machine::patient()).unwrap();
@@ -464,7 +465,7 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     assert_eq!(s.app.world().resource::<Notices>().0, [pliant_haptics::LoopEvent::Lost]);
     // The app continues, and a new device replaces the dead one.
     assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
     until(&mut s, "another one runs", |s| {
         let devices = s.app.world().resource::<HapticDevices>();

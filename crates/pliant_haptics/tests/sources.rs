@@ -75,7 +75,7 @@ impl Scene {
         }
     }
 
-    fn tick(&self) -> pliant_haptics::Tick {
+    fn tick(&self) -> pliant_haptics::LoopTick {
         self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.tick
     }
 
@@ -142,8 +142,8 @@ impl Scene {
 
     /// Puts the pointer at `at`, m from the center of the view in the plane z = 0.
     fn point(&mut self, window: Entity, at: Vec2) {
-        let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
-        let position = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
+        let pixels_a_meter = 300.0 / (2.0 * 0.5f32.tan());
+        let position = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_meter;
         let target = RenderTarget::Window(WindowRef::Entity(window)).normalize(None).unwrap();
         let action = PointerAction::Move { delta: Vec2::ZERO };
         let input = PointerInput::new(PointerId::Mouse, Location { target, position }, action);

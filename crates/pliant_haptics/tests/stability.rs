@@ -4,13 +4,13 @@
 
 mod rig;
 
-use pliant_haptics::{Hand, VirtualConfig};
+use pliant_haptics::{HandModel, VirtualConfig};
 use rig::Rig;
 
 /// Returns whether the motion of a free device on a bare spring of `k` (and damper `b`) decays. The
 /// function compares the energy in the last tenth of the time to that in the second tenth.
 fn calms(device: &VirtualConfig, k: f64, b: f64, seconds: f64) -> bool {
-    let mut rig = Rig::bare(device.clone(), Hand::NONE);
+    let mut rig = Rig::bare(device.clone(), HandModel::NONE);
     rig.cycle.device_mut().place([1e-3, 0.0, 0.0], [0.0; 3]);
     let ticks = (seconds * 1000.0) as usize;
     let (mut early, mut late) = (0.0f64, 0.0f64);
@@ -78,7 +78,7 @@ fn delayed_spring_is_stable_to_the_known_limit() {
 fn speed_at_wall(controlled: bool, resolution: f64, push: f64) -> f64 {
     let device =
         VirtualConfig { mass: 0.2, damping: 0.5, resolution, peak_force: 30.0, ..VirtualConfig::default() };
-    let mut rig = Rig::with(device, Hand::NONE, |s| {
+    let mut rig = Rig::with(device, HandModel::NONE, |s| {
         s.ramp = Some(1e-6);
         s.velocity = None;
         s.thermal = None;
@@ -124,7 +124,7 @@ fn damped_spring_two_sided_too() {
     // The spring is two-sided at three times the limit, with a 50 um encoder.
     let device = VirtualConfig { resolution: 50e-6, peak_force: 30.0, ..VirtualConfig::default() };
     let run = |controlled: bool| {
-        let mut rig = Rig::with(device.clone(), Hand::NONE, |s| {
+        let mut rig = Rig::with(device.clone(), HandModel::NONE, |s| {
             s.ramp = Some(1e-6);
             s.velocity = None;
             s.thermal = None;

@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_haptics::{
-    Contact, Coupling, DeviceInfo, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore, ModelWriter,
-    PublishedGrab, Sample, ToolMap, VirtualConfig, VirtualDevice,
+    Coupling, DeviceInfo, HandModel, HapticDevice, LocalModel, LoopConfig, LoopCore, ModelWriter,
+    PublishedGrab, Sample, ToolContact, ToolMap, VirtualConfig, VirtualDevice,
 };
 
 #[path = "rig/machine.rs"]
@@ -15,12 +15,17 @@ fn six() -> DeviceInfo {
     DeviceInfo { peak_torque: 0.5, torque_axes: [true; 3], resolution: 0.0, ..VirtualConfig::touch().info() }
 }
 
-fn spring(offset: [f64; 3], proxy: [f64; 3], k: f64) -> Contact {
-    Contact { offset, proxy, stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() }
+fn spring(offset: [f64; 3], proxy: [f64; 3], k: f64) -> ToolContact {
+    ToolContact {
+        offset,
+        proxy,
+        stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
+        ..ToolContact::default()
+    }
 }
 
 /// Holds the device still at `sample` until the ramp and the slew are over.
-fn settle(core: &mut LoopCore, sample: &Sample, contacts: &[Contact]) -> ([f64; 3], [f64; 3]) {
+fn settle(core: &mut LoopCore, sample: &Sample, contacts: &[ToolContact]) -> ([f64; 3], [f64; 3]) {
     let mut model = LocalModel { period: 0.01, count: contacts.len(), ..LocalModel::default() };
     model.contacts[..contacts.len()].copy_from_slice(contacts);
     let mut now = core.last().now;
@@ -54,7 +59,7 @@ fn two_grabs_on_a_tool_turn_it() {
     near(settle(&mut core, &Sample::default(), &[right, left]).1, [0.0; 3], "masked");
     // A torque above the motors' peak is clamped.
     let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
-    let strong = |c: Contact| Contact { stiffness: c.stiffness.map(|r| r.map(|x| 50.0 * x)), ..c };
+    let strong = |c: ToolContact| ToolContact { stiffness: c.stiffness.map(|r| r.map(|x| 50.0 * x)), ..c };
     near(settle(&mut core, &Sample::default(), &[strong(right), strong(left)]).1, [0.0, 0.0, 0.5], "clamped");
 }
 
@@ -111,7 +116,7 @@ fn scale_masks_and_weight() {
 #[test]
 fn a_body_elsewhere_is_felt_through_what_is_published() {
     // The body is stepped elsewhere, and its point and force come over the network.
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::NONE).unwrap();
     let config = LoopConfig::default();
     let coupling = Coupling::clamp(&config.coupling, &device.info(), config.rate, 0.0, 0.0);
     let grab = coupling.grab_config(1.0, 1.0);
@@ -150,7 +155,7 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
 fn two_devices_at_once() {
     use pliant_haptics::HapticLoop;
     let start = |x: f64| {
-        let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+        let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
         device.handle().set_target([x, 0.0, 0.0]);
         HapticLoop::start(device, machine::patient()).unwrap()
     };

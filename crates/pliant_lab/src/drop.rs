@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Instant};
 
 use nalgebra::{UnitQuaternion, Vector3};
 use pliant_modal::{
-    Body, BodyConfig, Contacts, Elasticity, Islands, ModalModel, ModelError, Obstacle, Plane, Sphere,
+    Body, BodyConfig, Contacts, Elasticity, Islands, ModalModel, ModelError, ObstacleShape, Plane, Sphere,
     StepSettings, Together,
 };
 use serde::Serialize;
@@ -16,7 +16,7 @@ use crate::{
 };
 
 /// Largest number of steps of a fall.
-const MOST_TICKS: f64 = 1e7;
+const MAX_TICKS: f64 = 1e7;
 
 /// What a body falls onto.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -72,7 +72,7 @@ impl Default for Drop {
 
 /// The body after one step. Energies include those of the body that it falls onto.
 #[derive(Serialize, Debug, Clone, Copy, PartialEq, Default)]
-pub struct Tick {
+pub struct DropTick {
     /// Time, s.
     pub time: f64,
     /// Center of mass, m, world axes.
@@ -109,7 +109,7 @@ pub struct Dropped {
     /// Time of one step of all bodies on one core.
     pub step_us: Percentiles,
     /// The start and the end of every step.
-    pub ticks: Vec<Tick>,
+    pub ticks: Vec<DropTick>,
 }
 
 impl Drop {
@@ -122,7 +122,7 @@ impl Drop {
         number("tilt", "-89 to 89 degrees", (-89.0..=89.0).contains(&tilt), tilt)?;
         number("gravity", "0 to 1e6 m/s^2", (0.0..=1e6).contains(&gravity), gravity)?;
         number("rate", "1 to 1e6 steps a second", (1.0..=1e6).contains(&rate), rate)?;
-        let sound = seconds > 0.0 && seconds * rate <= MOST_TICKS;
+        let sound = seconds > 0.0 && seconds * rate <= MAX_TICKS;
         number("seconds", "above 0 and at most ten million steps", sound, seconds)?;
         if let Onto::Sphere(radius) = self.onto {
             number("radius of the sphere", "above 0 m, at most 1e6", radius > 0.0 && radius <= 1e6, radius)?;
@@ -131,11 +131,11 @@ impl Drop {
     }
 }
 
-fn tick(bodies: &[Body], time: f64, step_us: f64) -> Tick {
+fn tick(bodies: &[Body], time: f64, step_us: f64) -> DropTick {
     let sum = |of: fn(&Body) -> f64| bodies.iter().map(of).sum::<f64>();
-    let [body, ..] = bodies else { return Tick { time, step_us, ..Tick::default() } };
+    let [body, ..] = bodies else { return DropTick { time, step_us, ..DropTick::default() } };
     let report = body.contacts().report();
-    Tick {
+    DropTick {
         time,
         center: body.frame().center(),
         velocity: body.frame().velocity(),
@@ -179,7 +179,7 @@ pub fn drop(model: &Arc<ModalModel>, drop: &Drop) -> Result<Dropped, LabError> {
     let [x, _, z] = model.center_of_mass();
     let [i, j, k, w] = [turn.i, turn.j, turn.k, turn.w];
     let mut under = None;
-    let obstacle: Arc<dyn Obstacle> = match &drop.onto {
+    let obstacle: Arc<dyn ObstacleShape> = match &drop.onto {
         Onto::Plane => Arc::new(Plane { point: [0.0; 3], normal }),
         Onto::Sphere(radius) => {
             Arc::new(Sphere { center: (turn * Vector3::new(x, -radius, z)).into(), radius: *radius })

@@ -86,7 +86,7 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
         return Err(LabError::Free);
     }
     if let Some(&got) = pull.at.iter().find(|x| !x.is_finite()) {
-        let expected = "finite metres";
+        let expected = "finite meters";
         return Err(ModelError::Value { what: "point of the pull", index: 0, expected, got }.into());
     }
     let _pinned = Pinned::new();

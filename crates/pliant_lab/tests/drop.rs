@@ -20,7 +20,7 @@ fn a_body_falls_freely_until_it_touches_and_then_lies() {
     let dropped = drop(&model, &Drop { seconds: 8.0, ..Drop::default() }).unwrap();
     let (first, last) = (dropped.ticks[0], dropped.ticks[dropped.ticks.len() - 1]);
     assert_eq!((dropped.ticks.len(), last.time), (481, 8.0));
-    let total = |tick: &pliant_lab::drop::Tick| tick.kinetic + tick.elastic + tick.potential;
+    let total = |tick: &pliant_lab::drop::DropTick| tick.kinetic + tick.elastic + tick.potential;
     for tick in &dropped.ticks {
         assert!(total(tick) <= total(&first) + 1e-9, "{} s: {} J", tick.time, total(tick));
         if tick.time < (2.0 * 0.1 / 9.81f64).sqrt() - 0.02 {
@@ -73,7 +73,7 @@ fn a_body_falls_onto_another_and_energy_never_rises() {
     for base in [pip, jack()] {
         let fall = Drop { onto: Onto::Body(base), seconds: 1.0, height: 0.05, ..Drop::default() };
         let dropped = drop(&jack(), &fall).unwrap();
-        let total = |tick: &pliant_lab::drop::Tick| tick.kinetic + tick.elastic + tick.potential;
+        let total = |tick: &pliant_lab::drop::DropTick| tick.kinetic + tick.elastic + tick.potential;
         let first = total(&dropped.ticks[0]);
         assert!(dropped.ticks.iter().all(|tick| total(tick) <= first + 1e-9));
         // It begins above the other and touches it first.

@@ -20,11 +20,11 @@ const SETTLED: Duration = Duration::from_secs(5);
 /// A host plays a guest's targets back, and limits the speed of the hand to twenty body sizes a
 /// second.
 const DELAY: usize = 2;
-const MOST: f64 = 20.0 / 40.0;
+const MAX: f64 = 20.0 / 40.0;
 
 /// Largest reaction that may be shown, as a share of the largest true one: a fifth beyond it, and
 /// the rounding of the frames.
-const MOST_SHOWN: f64 = 1.2 + 1e-4;
+const MAX_SHOWN: f64 = 1.2 + 1e-4;
 
 struct Hitched {
     scene: Scene,
@@ -44,7 +44,7 @@ impl World for Hitched {
     fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
         for (key, id, ..) in &self.scene.grabs {
             let Some(hand) = self.hands.get_mut(key) else { continue };
-            self.scene.body.set_target(*id, hand.next(DELAY, MOST).into()).unwrap();
+            self.scene.body.set_target(*id, hand.next(DELAY, MAX).into()).unwrap();
         }
         self.scene.step(now, tick, host);
         if now > SETTLED {
@@ -170,7 +170,7 @@ fn worst(who: Who, seeds: u64, lasts: Duration) -> (f64, f64) {
 #[test]
 fn hitches_are_not_kicks() {
     let all = [Who::Nobody, Who::Host, Who::Guest, Who::Both].map(|who| worst(who, 10, 30 * S));
-    assert!(all.iter().all(|(ratio, _)| *ratio <= MOST_SHOWN), "{all:?}");
+    assert!(all.iter().all(|(ratio, _)| *ratio <= MAX_SHOWN), "{all:?}");
 }
 
 /// The same at length, run by hand.
@@ -178,5 +178,5 @@ fn hitches_are_not_kicks() {
 #[ignore = "takes minutes"]
 fn a_hundred_sessions_of_hitches_are_not_kicks() {
     let all = [Who::Host, Who::Guest, Who::Both].map(|who| worst(who, 100, 60 * S));
-    assert!(all.iter().all(|(ratio, _)| *ratio <= MOST_SHOWN), "{all:?}");
+    assert!(all.iter().all(|(ratio, _)| *ratio <= MAX_SHOWN), "{all:?}");
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_stream::emulator::{LinkConfig, Preset};
 use pliant_stream::{
-    GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig, Pose,
+    GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig, RigidState,
     StepSettings,
 };
 use support::scene::{BODY, S, Scene, cached, circling, start};
@@ -109,7 +109,7 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
     let settings = StepSettings { gravity: [0.0, 0.0, -0.3], ..Default::default() };
     let mut pair = Pair::new(HostSessionConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
-    struct Watch(Scene, Vec<(u64, Pose)>, Vec<(u64, Pose)>);
+    struct Watch(Scene, Vec<(u64, RigidState)>, Vec<(u64, RigidState)>);
     impl World for Watch {
         fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
             self.0.step(now, tick, host);
@@ -130,7 +130,7 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
     let path = PathConfig::symmetric(LinkConfig::preset(Preset::Paper2));
     pair.join_with(GuestSessionConfig::default(), path, 3, cached(&model)).unwrap();
     pair.run_until(25 * S, &mut watch);
-    let off = |seen: &[(u64, Pose)]| {
+    let off = |seen: &[(u64, RigidState)]| {
         let (mut sum, mut count) = (0.0, 0.0_f64);
         for (tick, pose) in seen {
             let Some((_, truth)) = watch.0.poses.iter().find(|p| p.0 == *tick) else { continue };

@@ -138,7 +138,7 @@ fn frames_that_scatter_like_a_picture_rate_are_shown_evenly_and_without_guessing
 }
 
 #[test]
-fn a_force_that_the_stream_does_not_say_is_learnt() {
+fn a_force_that_the_stream_does_not_say_is_learned() {
     let model = bar(40, 0.05);
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
@@ -152,7 +152,7 @@ fn a_force_that_the_stream_does_not_say_is_learnt() {
     println!("worst {:.3} %", 100.0 * worst);
     assert!(worst < 0.05, "{worst}");
     let counts = pair.guests[0].session.body(BODY).unwrap().counts();
-    assert!(counts.snapshots <= 1, "learnt, not sent again and again: {counts:?}");
+    assert!(counts.snapshots <= 1, "learned, not sent again and again: {counts:?}");
 }
 
 #[test]

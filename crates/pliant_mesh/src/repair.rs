@@ -167,11 +167,11 @@ impl Surface {
     /// Turns triangles until neighbors across an edge of two triangles agree, as few as possible in
     /// each piece. Returns the number of turned triangles.
     fn wind_alike(&mut self) -> usize {
-        let mut neighbours = vec![Vec::new(); self.triangles.len()];
+        let mut neighbors = vec![Vec::new(); self.triangles.len()];
         for same in self.edges().values() {
             if let [(a, x), (b, y)] = same[..] {
-                neighbours[a as usize].push((b as usize, x == y));
-                neighbours[b as usize].push((a as usize, x == y));
+                neighbors[a as usize].push((b as usize, x == y));
+                neighbors[b as usize].push((a as usize, x == y));
             }
         }
         // Some(true) marks a triangle that is to be turned.
@@ -185,7 +185,7 @@ impl Surface {
             let mut next = 0;
             while let Some(&t) = piece.get(next) {
                 next += 1;
-                for &(other, against) in &neighbours[t] {
+                for &(other, against) in &neighbors[t] {
                     if turn[other].is_none() {
                         turn[other] = turn[t].map(|turned| turned != against);
                         piece.push(other);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, Obstacle,
+    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, ObstacleShape,
     Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
     step::{
@@ -170,13 +170,13 @@ impl Body {
         }
         self.kernel.prepare(&self.hands);
         self.config = BodyConfig { modes: self.config.modes, ..config };
-        let flows = if settings.relaxation.is_some() { self.mode_count() } else { 0 };
-        self.state.z.resize(flows, 0.0);
+        let branches = if settings.relaxation.is_some() { self.mode_count() } else { 0 };
+        self.state.z.resize(branches, 0.0);
         for (i, force) in self.resisted.iter().enumerate() {
             self.state.a[i] += force - resisted(&self.kernel, &self.state, &settings, i);
         }
         if settings.relaxation.is_none() {
-            self.hands.iter_mut().for_each(|hand| hand.flow = Vector3::zeros());
+            self.hands.iter_mut().for_each(|hand| hand.viscoelastic = Vector3::zeros());
         }
         Ok(())
     }
@@ -243,15 +243,15 @@ impl Body {
     /// Obstacles that move are set before every step, each at the same index.
     ///
     /// # Errors
-    /// Returns the error of [`Obstacle::check`]. The old obstacles then stay.
-    pub fn set_obstacles(&mut self, obstacles: Vec<Arc<dyn Obstacle>>) -> Result<(), StepError> {
+    /// Returns the error of [`ObstacleShape::check`]. The old obstacles then stay.
+    pub fn set_obstacles(&mut self, obstacles: Vec<Arc<dyn ObstacleShape>>) -> Result<(), StepError> {
         let prepared = self.contacts.obstacles().len() == obstacles.len();
         self.contacts.set_obstacles(obstacles)?;
         if prepared { Ok(()) } else { self.kernel.prepare_contacts(&mut self.contacts) }
     }
 
     /// Sets the coefficient of friction between the body and all obstacles, 0 to
-    /// [`Contacts::MOST_FRICTION`]. Default: [`Contacts::FRICTION`].
+    /// [`Contacts::MAX_FRICTION`]. Default: [`Contacts::FRICTION`].
     ///
     /// # Errors
     /// Returns [`StepError::Input`] for another number. The old one then stays.
@@ -417,7 +417,7 @@ impl Body {
     /// # Errors
     /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_viscoelastic_state(&self, id: GrabId) -> Result<[f64; 3], StepError> {
-        Ok(self.hands[self.find(id)?].flow.into())
+        Ok(self.hands[self.find(id)?].viscoelastic.into())
     }
 
     /// Sets the value that [`grab_viscoelastic_state`](Self::grab_viscoelastic_state) returns.
@@ -426,11 +426,15 @@ impl Body {
     ///
     /// # Errors
     /// Returns an error if there is no such grab or a number is not finite.
-    pub fn set_grab_viscoelastic_state(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
-        finite("grab flow", &flow)?;
+    pub fn set_grab_viscoelastic_state(
+        &mut self,
+        id: GrabId,
+        viscoelastic: [f64; 3],
+    ) -> Result<(), StepError> {
+        finite("grab viscoelastic state", &viscoelastic)?;
         let index = self.find(id)?;
         if self.config.settings.relaxation.is_some() {
-            self.hands[index].flow = flow.into();
+            self.hands[index].viscoelastic = viscoelastic.into();
         }
         Ok(())
     }

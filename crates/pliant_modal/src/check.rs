@@ -64,7 +64,7 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
     each("rotation", "finite", &mut parts.rotation.iter().map(|&x| f64::from(x)), &any)?;
     each("participation", "finite", &mut parts.participation.iter().flatten().copied(), &any)?;
     each("mass", "kg above 0", &mut [parts.mass].into_iter(), &positive)?;
-    each("center_of_mass", "finite metres", &mut parts.center_of_mass.into_iter(), &any)?;
+    each("center_of_mass", "finite meters", &mut parts.center_of_mass.into_iter(), &any)?;
     each("inertia", "finite", &mut parts.inertia.into_iter().flatten(), &any)?;
     check_inertia(&parts.inertia)?;
     each("young", "Pa above 0", &mut [info.young].into_iter(), &positive)?;

@@ -66,7 +66,7 @@ pub type Rows = [Vec<f64>; 3];
 
 /// Finds shapes in which a patch is led from rest along `direction` in the given `ways` (m), until
 /// the energy exceeds `most` (J).
-pub fn led(
+pub fn guided_shapes(
     energy: &mut ElasticEnergy,
     omega: &[f64],
     patch: &Rows,
@@ -276,7 +276,7 @@ fn non_negative(gram: &[Vec<f64>], right: &[f64], x: &mut [f64]) {
         factor.factor();
         let mut found: Vec<f64> = index.iter().map(|&i| right[i]).collect();
         factor.solve(&mut found);
-        // The largest step towards the solution that keeps all weights.
+        // The largest step toward the solution that keeps all weights.
         let mut step = 1.0f64;
         for (&i, &to) in index.iter().zip(found.iter()) {
             if to <= 0.0 {

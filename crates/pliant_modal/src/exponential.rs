@@ -18,22 +18,22 @@ impl DoubleDouble {
         let sum = self.0 + other.0;
         let part = sum - self.0;
         let error = (self.0 - (sum - part)) + (other.0 - part);
-        Self::renormalised(sum, error + (self.1 + other.1))
+        Self::renormalized(sum, error + (self.1 + other.1))
     }
 
     fn times(self, other: Self) -> Self {
         let product = self.0 * other.0;
         let error = self.0.mul_add(other.0, -product);
-        Self::renormalised(product, error + (self.0 * other.1 + self.1 * other.0))
+        Self::renormalized(product, error + (self.0 * other.1 + self.1 * other.0))
     }
 
     fn over(self, by: f64) -> Self {
         let first = self.0 / by;
         let rest = first.mul_add(-by, self.0) + self.1;
-        Self::renormalised(first, rest / by)
+        Self::renormalized(first, rest / by)
     }
 
-    fn renormalised(high: f64, low: f64) -> Self {
+    fn renormalized(high: f64, low: f64) -> Self {
         let sum = high + low;
         Self(sum, low - (sum - high))
     }

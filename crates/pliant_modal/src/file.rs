@@ -270,11 +270,11 @@ fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// its name is neither followed nor overwritten.
 fn new_partial(goal: &Path, name: &std::ffi::OsStr) -> io::Result<(fs::File, std::path::PathBuf)> {
     /// Most names that are tried, because files of killed writers may have them.
-    const MOST: usize = 1000;
+    const MAX: usize = 1000;
     // Two threads that write the same file use separate temporary files. The last rename wins.
     static WRITES: AtomicU64 = AtomicU64::new(0);
     let mut last = io::Error::from(io::ErrorKind::AlreadyExists);
-    for _ in 0..MOST {
+    for _ in 0..MAX {
         let write = WRITES.fetch_add(1, Ordering::Relaxed);
         let mut partial = name.to_owned();
         partial.push(format!(".{}.{write}.partial", std::process::id()));

@@ -7,7 +7,7 @@
 //! A bake reduces a body to a few vibration modes. At run time only the modal coordinates `q` move:
 //!
 //! ```text
-//! q'' + c q' + omega^2 q = f        one scalar equation a mode, mass-normalised (phi^T M phi = 1)
+//! q'' + c q' + omega^2 q = f        one scalar equation a mode, mass-normalized (phi^T M phi = 1)
 //! u(x) = R~(Psi(x) q) Phi(x) q      the displacement, warped (Choi and Ko 2005)
 //! ```
 //!
@@ -61,7 +61,8 @@ mod warp;
 pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, GrabId};
 pub use contact::{
-    Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint, Touched,
+    Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint,
+    Touched,
 };
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};

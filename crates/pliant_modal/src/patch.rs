@@ -35,7 +35,7 @@ impl Patch {
             return Err(ModelError::Value {
                 what: "patch radius",
                 index: 0,
-                expected: "finite metres, 0 or more",
+                expected: "finite meters, 0 or more",
                 got: radius,
             });
         }

@@ -163,9 +163,9 @@ impl Coefficients {
                 alpha(omega, c, relaxation, h, [am, af, (gamma + 0.5).powi(2) / 4.0, gamma])
             }
         };
-        let (table, flow) = &made;
-        let mut numbers = table.free.iter().flatten().chain(&table.response).chain(&flow.onto);
-        let finite = numbers.all(|x| x.is_finite()) && flow.free.iter().all(|x| x.is_finite());
+        let (table, viscoelastic) = &made;
+        let mut numbers = table.free.iter().flatten().chain(&table.response).chain(&viscoelastic.onto);
+        let finite = numbers.all(|x| x.is_finite()) && viscoelastic.free.iter().all(|x| x.is_finite());
         StepError::check("omega", "a frequency whose square is finite", finite, omega)?;
         Ok(made)
     }
@@ -233,11 +233,11 @@ fn alpha(
     let q = [1.0 + bh * a[0], h + bh * a[1], ph + bh * a[2], bh * a[3]];
     let v = [gh * a[0], 1.0 + gh * a[1], mh + gh * a[2], gh * a[3]];
     let table = Coefficients { free: [q, v, a], response: [bh * r, gh * r, r] };
-    let flow = ViscoelasticCoefficients {
+    let viscoelastic = ViscoelasticCoefficients {
         onto: [bh * a_z, gh * a_z, a_z],
         free: [w0 + w1 * q[0], w1 * q[1], w1 * q[2], w1 * q[3]],
         carry: e + w1 * bh * a_z,
         response: w1 * bh * r,
     };
-    (table, flow)
+    (table, viscoelastic)
 }

@@ -56,7 +56,7 @@ impl SurfaceMesh {
         }
         for (index, p) in positions.iter().enumerate() {
             if let Some(bad) = p.iter().find(|x| !x.is_finite()) {
-                return Err(value("surface positions", index, "finite metres", f64::from(*bad)));
+                return Err(value("surface positions", index, "finite meters", f64::from(*bad)));
             }
         }
         for (index, t) in triangles.iter().enumerate() {

@@ -91,13 +91,13 @@ pub fn shape(element: Element, l: [f64; 4]) -> [f64; MAX_NODES] {
 /// Returns the points of the quadrature that integrates the stiffness exactly, and their common
 /// weight as a fraction of the volume.
 pub fn stiffness_points(element: Element) -> (&'static [[f64; 4]], f64) {
-    const CENTRE: [[f64; 4]; 1] = [[0.25; 4]];
+    const CENTER: [[f64; 4]; 1] = [[0.25; 4]];
     // Quadrature rule of degree 2: a = (5 + 3 sqrt 5) / 20, b = (5 - sqrt 5) / 20.
     const A: f64 = 0.585_410_196_624_968_5;
     const B: f64 = 0.138_196_601_125_010_5;
     const FOUR: [[f64; 4]; 4] = [[A, B, B, B], [B, A, B, B], [B, B, A, B], [B, B, B, A]];
     match element {
-        Element::Tet4 => (&CENTRE, 1.0),
+        Element::Tet4 => (&CENTER, 1.0),
         Element::Tet10 => (&FOUR, 0.25),
     }
 }

@@ -25,7 +25,7 @@ fn patch(model: &ModalModel) -> Patch {
 }
 
 /// Returns the reaction along the rod at the end of each step, N.
-fn felt(model: &Arc<ModalModel>, hz: f64, second_order: bool) -> Vec<f64> {
+fn reactions(model: &Arc<ModalModel>, hz: f64, second_order: bool) -> Vec<f64> {
     let config = BodyConfig {
         step: 1.0 / hz,
         settings: StepSettings { second_order, warp: false, ..Default::default() },
@@ -88,16 +88,16 @@ fn exact(model: &Arc<ModalModel>, hz: f64, fine: f64) -> Vec<f64> {
 }
 
 /// Returns the largest and the root mean square difference, as shares of the largest force.
-fn error(felt: &[f64], exact: &[f64]) -> (f64, f64) {
+fn error(reactions: &[f64], exact: &[f64]) -> (f64, f64) {
     let peak = exact.iter().fold(0.0f64, |peak, f| peak.max(f.abs()));
-    let off = || felt.iter().zip(exact).map(|(a, b)| (a - b) / peak);
+    let off = || reactions.iter().zip(exact).map(|(a, b)| (a - b) / peak);
     (off().fold(0.0, |m, x| m.max(x.abs())), (off().map(|x| x * x).sum::<f64>() / exact.len() as f64).sqrt())
 }
 
 #[test]
 fn what_a_hand_feels_is_of_second_order() {
     let model = Arc::new(rod(2e5, MODES, 0.05, false));
-    let of = |hz: f64, second| error(&felt(&model, hz, second), &exact(&model, hz, 192_000.0));
+    let of = |hz: f64, second| error(&reactions(&model, hz, second), &exact(&model, hz, 192_000.0));
     for hz in [60.0, 120.0, 240.0, 480.0] {
         let (first, second) = (of(hz, false), of(hz, true));
         println!(
@@ -152,7 +152,7 @@ impl Bent {
         self.way.map(|reach| reach * way(t) / way(MOVES))
     }
 
-    fn felt(&self, hz: f64) -> Vec<[f64; 3]> {
+    fn reactions(&self, hz: f64) -> Vec<[f64; 3]> {
         let config = BodyConfig { step: 1.0 / hz, ..Default::default() };
         let mut body = Body::new(self.model.clone(), config).unwrap();
         let grab = body.grab(&self.patch, SOFT).unwrap();
@@ -227,11 +227,11 @@ fn what_a_hand_feels_of_a_bent_body_comes_nearer_with_the_step() {
     let exact = bent.exact(960.0, 19_200.0);
     let peak = exact.iter().flatten().fold(0.0f64, |peak, f| peak.max(f.abs()));
     let errors = [240.0, 480.0, 960.0].map(|hz| {
-        let felt = bent.felt(hz);
+        let reactions = bent.reactions(hz);
         let every = (960.0 / hz) as usize;
         let right = exact.iter().skip(every - 1).step_by(every);
-        let off = felt.iter().zip(right).flat_map(|(a, b)| (0..3).map(move |k| a[k] - b[k]));
-        let rms = (off.map(|x| x * x).sum::<f64>() / felt.len() as f64).sqrt() / peak;
+        let off = reactions.iter().zip(right).flat_map(|(a, b)| (0..3).map(move |k| a[k] - b[k]));
+        let rms = (off.map(|x| x * x).sum::<f64>() / reactions.len() as f64).sqrt() / peak;
         println!("{hz} Hz: rms {:.4} % of {peak:.3} N", 100.0 * rms);
         rms
     });

@@ -71,12 +71,12 @@ fn the_exact_step_is_exact() {
             [(0.4, 0.1), (0.95, 0.01), (0.3, 2e-4), (1e-9, 1.0), (0.6, 1.0 / 30.0), (0.5, 1e9)]
         {
             let (c, relaxation) = (2.0 * zeta * omega, Relaxation { ratio, time });
-            let (table, flow) = made(Integrator::Exact, omega, c, relaxation, h);
+            let (table, viscoelastic) = made(Integrator::Exact, omega, c, relaxation, h);
             let from = [0.3, -2.0, 0.2];
             let want = reference(omega, c, relaxation, h, 5.0, from);
             let mut got = table.step([from[0], from[1], 0.0], 0.0, 5.0);
-            (0..3).for_each(|i| got[i] += flow.onto[i] * from[2]);
-            let z = flow.step([from[0], from[1], 0.0], from[2], 0.0, 5.0);
+            (0..3).for_each(|i| got[i] += viscoelastic.onto[i] * from[2]);
+            let z = viscoelastic.step([from[0], from[1], 0.0], from[2], 0.0, 5.0);
             let what = format!("omega {omega}, zeta {zeta}, {relaxation:?}");
             assert!((got[0] - want[0]).abs() < 1e-10, "q, {what}: {} and {}", got[0], want[0]);
             assert!((got[1] - want[1]).abs() < 1e-8, "v, {what}: {} and {}", got[1], want[1]);
@@ -91,7 +91,7 @@ fn the_exact_step_is_exact() {
 fn without_a_ratio_it_is_the_elastic_step() {
     for integrator in ALL {
         for (omega, c, h) in [(30.0, 1.5, 0.02), (4e3, 80.0, 0.01), (0.5, 0.0, 0.1)] {
-            let (table, flow) = made(integrator, omega, c, Relaxation { ratio: 0.0, time: 0.1 }, h);
+            let (table, viscoelastic) = made(integrator, omega, c, Relaxation { ratio: 0.0, time: 0.1 }, h);
             let elastic = Coefficients::new(integrator, omega, c, h).unwrap();
             let pairs = table.free.iter().flatten().chain(&table.response);
             for (got, want) in pairs.zip(elastic.free.iter().flatten().chain(&elastic.response)) {
@@ -100,7 +100,7 @@ fn without_a_ratio_it_is_the_elastic_step() {
                     "{integrator:?}: {got} and {want}"
                 );
             }
-            assert!(flow.onto.iter().all(|x| *x == 0.0));
+            assert!(viscoelastic.onto.iter().all(|x| *x == 0.0));
         }
     }
 }
@@ -114,12 +114,12 @@ fn a_held_force_creeps_by_the_closed_form() {
         [(Integrator::Exact, 1e-4), (Integrator::GeneralizedAlpha { rho_inf: 0.5 }, 6e-3)]
     {
         let h = 0.01;
-        let (table, flow) = made(integrator, omega, 2.0 * omega, relaxation, h);
+        let (table, viscoelastic) = made(integrator, omega, 2.0 * omega, relaxation, h);
         let (mut x, mut z, mut old) = ([0.0; 3], 0.0, 0.0);
         for n in 1..=2_000 {
             let mut next = table.step(x, old, 1.0);
-            (0..3).for_each(|i| next[i] += flow.onto[i] * z);
-            z = flow.step(x, z, old, 1.0);
+            (0..3).for_each(|i| next[i] += viscoelastic.onto[i] * z);
+            z = viscoelastic.step(x, z, old, 1.0);
             (x, old) = (next, 1.0);
             let want = relaxation.creep(f64::from(n) * h) / (omega * omega);
             // For a force that starts within a step, generalized-alpha counts a third of a step
@@ -193,7 +193,7 @@ fn no_step_grows_at_any_stiffness_ratio_time_or_step() {
 /// generalized-alpha the energy never exceeds the largest value of the first hundred steps again.
 fn grows(integrator: Integrator, h: f64, omega: f64, zeta: f64, relaxation: Relaxation) {
     let c = 2.0 * zeta * omega;
-    let (table, flow) = made(integrator, omega, c, relaxation, h);
+    let (table, viscoelastic) = made(integrator, omega, c, relaxation, h);
     let x = 0.5 * h / relaxation.time;
     let kept = match integrator {
         Integrator::Exact => 1.0,
@@ -211,8 +211,8 @@ fn grows(integrator: Integrator, h: f64, omega: f64, zeta: f64, relaxation: Rela
         let (mut last, mut largest) = (first, first);
         for n in 0..200 {
             let mut next = table.step(state, 0.0, 0.0);
-            (0..3).for_each(|i| next[i] += flow.onto[i] * z);
-            z = flow.step(state, z, 0.0, 0.0);
+            (0..3).for_each(|i| next[i] += viscoelastic.onto[i] * z);
+            z = viscoelastic.step(state, z, 0.0, 0.0);
             state = next;
             let now = energy(state, z);
             // Newmark's accelerations of a mode far above the step rate are large, and so are their

@@ -8,7 +8,7 @@ use pliant_stream::UserId;
 use crate::transport::Fingerprint;
 
 /// Most keys that are remembered.
-const MOST_KNOWN: usize = 4096;
+const MAX_KNOWN: usize = 4096;
 
 #[derive(Debug, Clone, Copy)]
 struct KnownUser {
@@ -66,7 +66,7 @@ impl KnownUsers {
         if let Some(other) = self.keys.insert(user, key).filter(|other| *other != key) {
             self.users.remove(&other);
         }
-        while self.users.len() > MOST_KNOWN {
+        while self.users.len() > MAX_KNOWN {
             let absent = self.users.iter().filter(|(other, _)| **other != key && !is_present(other));
             let oldest = absent.min_by_key(|(_, known)| known.seen).map(|(&key, known)| (key, known.user));
             let Some((oldest, number)) = oldest else { return };
@@ -106,12 +106,12 @@ mod tests {
         let mut known = KnownUsers::default();
         // The first comes first and stays. The second came second, and has just gone.
         let is_present = |other: &Fingerprint| *other == key(1);
-        for user in 1..=MOST_KNOWN as u32 {
+        for user in 1..=MAX_KNOWN as u32 {
             known.see(key(user), number(user), is_present);
         }
         known.see(key(2), number(2), is_present);
         for user in 1..=10 {
-            let new = MOST_KNOWN as u32 + user;
+            let new = MAX_KNOWN as u32 + user;
             known.see(key(new), number(new), is_present);
         }
         assert_eq!(known.number_of(&key(1)), Some(UserId(1)), "who is present");
@@ -119,7 +119,7 @@ mod tests {
         assert_eq!(known.number_of(&key(3)), None, "who was seen longest ago");
         assert_eq!(known.number_of(&key(12)), None);
         assert_eq!(known.number_of(&key(13)), Some(UserId(13)));
-        assert_eq!(known.in_order().len(), MOST_KNOWN);
+        assert_eq!(known.in_order().len(), MAX_KNOWN);
         // They are the same after a restart, and in the same order.
         let restored = KnownUsers::restored(&known.in_order());
         assert_eq!(restored.in_order(), known.in_order());

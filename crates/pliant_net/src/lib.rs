@@ -84,7 +84,7 @@ pub use guest::{CameraInterest, GuestState, Interest, JoinConfig, NetGuest};
 pub use host::{Holding, HostConfig, NetHost};
 pub use peer::{NetPeer, PeerConfig, PeerState};
 pub use plugin::{NetError, NetPlugin, NetSystems};
-pub use recording::{Recording, RecordingError};
+pub use recording::{RecordingError, SessionRecording};
 pub use remote::{
     BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, SessionClosed, SessionJoined,
     SessionLost,

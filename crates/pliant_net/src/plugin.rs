@@ -13,7 +13,7 @@ use crate::guest::{self, JoinConfig, NetGuest};
 use crate::host::{self, HostConfig, NetHost};
 use crate::metrics::{self, NetStats, RateMarks};
 use crate::peer::{self, NetPeer, PeerConfig};
-use crate::recording::{Recording, RecordingError};
+use crate::recording::{RecordingError, SessionRecording};
 use crate::remote;
 use crate::shared_body::SharedBody;
 use crate::transport::{Endpoint, Invite, TransportError};
@@ -89,7 +89,7 @@ impl NetPlugin {
     /// Plays a recorded session in a guest, at the speed at which it was recorded. Bodies, users
     /// and hands appear and disappear as they did in the recorded session. Nothing is sent, and
     /// this app's own grabs have no effect.
-    pub fn replay(recording: Recording, mut config: JoinConfig) -> Self {
+    pub fn replay(recording: SessionRecording, mut config: JoinConfig) -> Self {
         config.models.extend(recording.models.iter().cloned());
         Self::new(Start::Join(Box::new(NetGuest::replay(config, recording))), None)
     }

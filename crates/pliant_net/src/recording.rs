@@ -29,7 +29,7 @@ const LEVEL: i32 = 3;
 /// this.
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
 /// Largest recording, bytes before compression. This is about a day at 1 Mbit/s.
-const MOST_BYTES: u64 = 12 << 30;
+const MAX_BYTES: u64 = 12 << 30;
 /// Largest record, bytes. The largest records are models.
 const LONGEST: u32 = 1 << 30;
 /// Largest zstd window is 2^27 bytes, so that no file makes a reader allocate more.
@@ -91,8 +91,8 @@ type Encoder = zstd::stream::write::Encoder<'static, File>;
 
 /// Most records, and most bytes in them, that may wait for the recorder's thread. Models are not
 /// counted, because they are in memory anyway.
-const MOST_WAITING: usize = 8192;
-const MOST_WAITING_BYTES: usize = 64 << 20;
+const MAX_WAITING: usize = 8192;
+const MAX_WAITING_BYTES: usize = 64 << 20;
 
 /// Data for the recorder's thread.
 enum KeptRecord {
@@ -126,7 +126,7 @@ impl SessionRecorder {
         file.write_all(MAGIC).map_err(fail)?;
         let encoder = zstd::stream::write::Encoder::new(file, LEVEL).map_err(fail)?;
         let waiting = Arc::new(AtomicUsize::new(0));
-        let (to, from) = mpsc::sync_channel(MOST_WAITING);
+        let (to, from) = mpsc::sync_channel(MAX_WAITING);
         let mut writer =
             RecordWriter { encoder, waiting: waiting.clone(), written: 0, flushed: Duration::ZERO };
         let named = path.to_owned();
@@ -152,7 +152,7 @@ impl SessionRecorder {
     fn send(&mut self, at: Duration, bytes: usize, kept: KeptRecord) {
         let Some(to) = &self.to else { return };
         let waiting = self.waiting.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        let full = waiting > MOST_WAITING_BYTES && bytes < waiting;
+        let full = waiting > MAX_WAITING_BYTES && bytes < waiting;
         let sent = if full { Err(TrySendError::Full((at, kept))) } else { to.try_send((at, kept)) };
         match sent {
             Ok(()) => {}
@@ -176,8 +176,8 @@ impl RecordWriter {
                 }
                 KeptRecord::Model(model) => SessionRecord::Model(model.to_bytes().into()),
             };
-            if self.written >= MOST_BYTES {
-                return Err(io::Error::other(format!("more than {MOST_BYTES} bytes")));
+            if self.written >= MAX_BYTES {
+                return Err(io::Error::other(format!("more than {MAX_BYTES} bytes")));
             }
             self.written += write(&mut self.encoder, at, &record)?;
             if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
@@ -225,14 +225,14 @@ fn write(to: &mut impl Write, at: Duration, record: &SessionRecord) -> io::Resul
 }
 
 /// A recorded session, to be played with [`NetPlugin::replay`](crate::NetPlugin::replay).
-pub struct Recording {
+pub struct SessionRecording {
     decoder: zstd::stream::read::Decoder<'static, BufReader<File>>,
     /// Models that the recorded guest had in its cache.
     pub(crate) models: Vec<Arc<ModalModel>>,
     next: Option<(Duration, SessionRecord)>,
 }
 
-impl Recording {
+impl SessionRecording {
     /// Opens a recording. Reads the whole file once, to find its models.
     ///
     /// # Errors
@@ -354,7 +354,7 @@ mod tests {
         let mut recorder = SessionRecorder::create(&path).unwrap();
         records.iter().for_each(|(at, record)| recorder.put(*at, record));
         drop(recorder);
-        let mut recording = Recording::open(&path).unwrap();
+        let mut recording = SessionRecording::open(&path).unwrap();
         assert_eq!(recording.poll(Duration::from_micros(1_499)), None, "not before its time");
         let mut played = Vec::new();
         for ms in 0..=20_000 {
@@ -369,7 +369,7 @@ mod tests {
         // panic.
         for cut in (0..bytes.len()).step_by(97) {
             std::fs::write(&path, &bytes[..cut]).unwrap();
-            match Recording::open(&path) {
+            match SessionRecording::open(&path) {
                 Err(RecordingError::Kind { .. }) => assert!(cut < 8),
                 Err(other) => panic!("{other}"),
                 Ok(mut recording) => {
@@ -380,11 +380,11 @@ mod tests {
             let mut wrong = bytes.clone();
             wrong[cut] ^= 0x55;
             std::fs::write(&path, &wrong).unwrap();
-            if let Ok(mut recording) = Recording::open(&path) {
+            if let Ok(mut recording) = SessionRecording::open(&path) {
                 while recording.poll(Duration::MAX).is_some() {}
             }
         }
         std::fs::remove_file(&path).unwrap();
-        assert!(matches!(Recording::open(&path), Err(RecordingError::File { .. })));
+        assert!(matches!(SessionRecording::open(&path), Err(RecordingError::File { .. })));
     }
 }

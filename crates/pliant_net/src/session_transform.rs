@@ -7,7 +7,7 @@
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::BodyState;
-use pliant_stream::{Placement, Pose};
+use pliant_stream::{Placement, RigidState};
 
 /// The map between an app's world and session coordinates for one body:
 ///
@@ -63,7 +63,7 @@ impl SessionTransform {
     }
 
     /// Converts a point in body axes to this app's world. `pose` is the pose of a free body.
-    pub(crate) fn body_point_to_world(&self, pose: Option<Pose>, point: DVec3) -> DVec3 {
+    pub(crate) fn body_point_to_world(&self, pose: Option<RigidState>, point: DVec3) -> DVec3 {
         let session = match pose {
             None => point,
             Some(pose) => DQuat::from_array(pose.rotation) * point + DVec3::from(pose.position),
@@ -82,7 +82,13 @@ impl SessionTransform {
 }
 
 /// Places a free body between two session poses.
-pub(crate) fn set_pose(transform: &mut Transform, from: &Pose, to: &Pose, fraction: f64, scale: f64) {
+pub(crate) fn set_pose(
+    transform: &mut Transform,
+    from: &RigidState,
+    to: &RigidState,
+    fraction: f64,
+    scale: f64,
+) {
     let origin = DVec3::from(from.position).lerp(DVec3::from(to.position), fraction) * scale;
     let [from, to] = [from, to].map(|pose| DQuat::from_array(pose.rotation).normalize());
     let rotation = from.slerp(to, fraction).normalize();

@@ -115,7 +115,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbours_differ_in_hue_and_names_hold_no_control_characters() {
+    fn neighbors_differ_in_hue_and_names_hold_no_control_characters() {
         let hue = |n| Hsla::from(color_of(UserId(n))).hue;
         for n in 0..20 {
             for m in n + 1..20 {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use bevy::prelude::*;
 use pliant_body::{BodyState, GrabForce, VisualState};
 use pliant_modal::HeldShapes;
-use pliant_stream::{GrabState, Pose, UserId};
+use pliant_stream::{GrabState, RigidState, UserId};
 
 use crate::patch_kinematics::PatchPoint;
 use crate::phase::Phase;
@@ -33,7 +33,7 @@ pub(crate) type Held<'a> = Option<(&'a Arc<HeldShapes>, &'a [f64])>;
 #[derive(Debug, Default, Clone)]
 struct Displayed {
     q: Vec<f64>,
-    pose: Option<Pose>,
+    pose: Option<RigidState>,
     shapes: Option<Arc<HeldShapes>>,
     s: Vec<f64>,
 }
@@ -51,7 +51,7 @@ pub(crate) struct BodyDisplay {
 
 impl BodyDisplay {
     /// Takes over the state of a tick.
-    pub(crate) fn take(&mut self, tick: u64, q: &[f64], pose: Option<Pose>, held: Held<'_>) {
+    pub(crate) fn take(&mut self, tick: u64, q: &[f64], pose: Option<RigidState>, held: Held<'_>) {
         let first = self.current.q.len() != q.len();
         if tick == self.tick && !first {
             // A correction may have moved the state of this tick, but the display goes on from the

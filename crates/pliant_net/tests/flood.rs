@@ -28,7 +28,7 @@ use support::{alone, bar_of, body_of, guest, host_of, messages, only, run_until}
 
 /// What one frame may read, bytes: the share of one peer that sends long datagrams, with its last
 /// one, of one that sends short messages, and what the others send.
-const MOST_READ: u64 = 16 * 512 + 1200 + 5 * 257 + 1500;
+const MAX_READ: u64 = 16 * 512 + 1200 + 5 * 257 + 1500;
 /// Cells of the body that is measured, which has four times as many vertices.
 const CELLS: u32 = 2500;
 
@@ -227,7 +227,7 @@ fn strangers_that_send_all_they_can_hold_up_no_frame_and_bar_nobody() {
     let _alone = alone();
     let flooded = flooded(&bar_of(16), Duration::from_secs(3), &ALL);
     let most = *flooded.read.iter().max().unwrap();
-    assert!(most <= MOST_READ, "{most} bytes read in one frame");
+    assert!(most <= MAX_READ, "{most} bytes read in one frame");
 }
 
 /// Run by hand, on a quiet machine and with `--release`.

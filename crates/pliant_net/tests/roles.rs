@@ -11,8 +11,8 @@ use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, VisualState};
 use pliant_net::{
     Access, GrabRefused, Grant, GuestState, HandOf, Holding, HostConfig, HostOptions, Interest, Invite,
-    JoinConfig, NetGuest, NetPlugin, NetStats, Recording, RemoteHands, Role, SessionClosed, SharedBody,
-    Token, User, UserLink,
+    JoinConfig, NetGuest, NetPlugin, NetStats, RemoteHands, Role, SessionClosed, SessionRecording,
+    SharedBody, Token, User, UserLink,
 };
 use pliant_stream::DisconnectReason;
 use support::{
@@ -180,7 +180,7 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     drop(seen);
     drop(host);
 
-    let recording = Recording::open(&path).unwrap();
+    let recording = SessionRecording::open(&path).unwrap();
     let mut again = app(NetPlugin::replay(recording, JoinConfig::default()));
     run_until(&mut [&mut again], "the recording is over", |apps| {
         !messages::<SessionClosed>(apps[0]).is_empty()

@@ -281,13 +281,13 @@ fn a_recording_has_a_section_and_its_knobs_change_it() {
 #[test]
 fn the_stop_and_the_force_of_a_device_are_its_own() {
     use pliant_haptics::{
-        Hand, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, VirtualConfig, VirtualDevice,
+        HandModel, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, VirtualConfig, VirtualDevice,
     };
 
     let mut app = app(|app| {
         app.add_plugins(HapticsPlugin::default());
     });
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
     let tool = HapticTool { force_scale: 2.0, ..HapticTool::new(device) };
     let tool = app.world_mut().spawn((tool, Transform::default())).id();
@@ -300,7 +300,7 @@ fn the_stop_and_the_force_of_a_device_are_its_own() {
     assert!(stopped(&shown));
     // Another device connects, and the only stopped device disconnects. The stop stays latched, and
     // can be pressed and released.
-    let later = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let later = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let mut devices = shown.state_mut().world_mut().resource_mut::<HapticDevices>();
     devices.add(later, LoopConfig::default()).unwrap();
     shown.run_steps(3);

@@ -17,10 +17,10 @@ use rerun::{
 use crate::recorder::path;
 
 /// Maximum number of places for plots. Further plots share the last place, as tabs.
-const MOST_CELLS: usize = 8;
+const MAX_CELLS: usize = 8;
 
 /// Maximum number of bodies whose bars have a tab. The bars of other bodies can be opened manually.
-const MOST_TABS: usize = 12;
+const MAX_TABS: usize = 12;
 
 /// Areas about how the program runs, as opposed to bodies, hands and the network. They share one
 /// place, in tabs.
@@ -126,7 +126,7 @@ impl Plots {
             plots.into_iter().map(|(_, plot)| plot).collect()
         });
         let mut cells: Vec<Vec<Plot>> = cells.collect();
-        let beyond: Vec<Plot> = cells.drain(MOST_CELLS.min(cells.len())..).flatten().collect();
+        let beyond: Vec<Plot> = cells.drain(MAX_CELLS.min(cells.len())..).flatten().collect();
         if let Some(last) = cells.last_mut() {
             last.extend(beyond);
         }
@@ -143,7 +143,7 @@ impl Plots {
         if names.len() == 1 {
             return names.first().map(|name| view(title.to_owned(), name).into());
         }
-        let tabs = names.iter().take(MOST_TABS).map(|name| view(format!("{title}: {name}"), name).into());
+        let tabs = names.iter().take(MAX_TABS).map(|name| view(format!("{title}: {name}"), name).into());
         Some(Tabs::new(tabs).into())
     }
 

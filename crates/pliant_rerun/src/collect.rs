@@ -304,7 +304,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut RecordedFrame, bodies: &
         }
         stays
     });
-    for (entity, name, state, shown, driven, transform, style) in bodies {
+    for (entity, name, state, visual, driven, transform, style) in bodies {
         let style = style.copied().unwrap_or_default();
         let known = collector.bodies.get(&entity);
         if known
@@ -321,23 +321,23 @@ fn follow_bodies(collector: &mut Collector, frame: &mut RecordedFrame, bodies: &
         let (scale, rotation, translation) = transform.to_scale_rotation_translation();
         let place =
             BodyTransform { translation: translation.into(), rotation: rotation.into(), scale: scale.x };
-        let moved = followed.version != shown.version() || followed.place != Some(place);
+        let moved = followed.version != visual.version() || followed.place != Some(place);
         let draw = wanted.draw && style != RerunStyle::Hidden;
-        if !moved && shown.is_settled() && (followed.complete || !draw) {
+        if !moved && visual.is_settled() && (followed.complete || !draw) {
             continue;
         }
         if !(draw || wanted.metrics || wanted.sample) {
             // The body still counts as moved until its data is wanted.
             continue;
         }
-        followed.version = shown.version();
+        followed.version = visual.version();
         followed.place = Some(place);
-        followed.complete = draw && shown.is_settled();
+        followed.complete = draw && visual.is_settled();
         let from = frame.coordinates.len();
-        frame.coordinates.extend(shown.current().iter().map(|&q| q as f32));
+        frame.coordinates.extend(visual.current().iter().map(|&q| q as f32));
         let energies = (wanted.metrics || wanted.bars).then(|| {
             let from = frame.energies.len();
-            energies(&mut frame.energies, state, driven, shown, wanted.tick);
+            energies(&mut frame.energies, state, driven, visual, wanted.tick);
             from..frame.energies.len()
         });
         frame.shapes.push(ShapeFrame {
@@ -369,7 +369,7 @@ fn free_path(bodies: &HashMap<Entity, Followed>, entity: Entity, name: Option<&N
 ///
 /// The velocities of a remote body are computed from the change of its shape over the last tick of
 /// `tick` seconds.
-fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &VisualState, tick: f64) {
+fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, visual: &VisualState, tick: f64) {
     let body = state.body();
     let scale = state.scale() * state.scale();
     let of = |omega: f64, q: f64, v: f64| 0.5 * scale * (v * v + (omega * q).powi(2));
@@ -379,7 +379,7 @@ fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &Visua
             to.extend(kept.zip(body.q()).zip(body.v()).map(|((&omega, &q), &v)| of(omega, q, v)));
         }
         Driven::Remote => {
-            to.extend(kept.zip(shown.current().iter().zip(shown.previous())).map(
+            to.extend(kept.zip(visual.current().iter().zip(visual.previous())).map(
                 |(&omega, (&q, &before))| of(omega, q, if tick > 0.0 { (q - before) / tick } else { 0.0 }),
             ))
         }

@@ -65,7 +65,7 @@ pub(crate) struct Columns {
 
 impl Columns {
     /// Number of waiting values at which they are sent, regardless of the time.
-    const MOST: usize = 1 << 14;
+    const MAX: usize = 1 << 14;
 
     pub fn push(&mut self, name: &str, at: Moment, value: f64) {
         if !self.series.contains_key(name) {
@@ -81,7 +81,7 @@ impl Columns {
 
     /// Whether the values should be sent now.
     pub fn is_full(&self) -> bool {
-        self.waiting >= Self::MOST
+        self.waiting >= Self::MAX
     }
 
     pub fn send(&mut self, stream: &RecordingStream) -> Result<(), RecordingStreamError> {

@@ -13,7 +13,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use crate::frame::Line;
 
 /// Maximum number of lines that wait for a tick. Further lines are dropped.
-const MOST: usize = 1024;
+const MAX: usize = 1024;
 
 /// Maximum number of characters of a line.
 const LONGEST: usize = 2000;
@@ -34,7 +34,7 @@ pub(crate) struct LogLines(pub Receiver<Line>);
 /// App::new().add_plugins(DefaultPlugins.set(LogPlugin { custom_layer: pliant_rerun::log_layer, ..default() }));
 /// ```
 pub fn log_layer(app: &mut App) -> Option<BoxedLayer> {
-    let (lines, taken) = bounded(MOST);
+    let (lines, taken) = bounded(MAX);
     app.insert_resource(LogLines(taken));
     Some(Box::new(Lines(lines)))
 }

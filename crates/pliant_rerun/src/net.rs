@@ -133,12 +133,13 @@ pub(crate) fn see_other_hands(
     users: Query<&User>,
 ) {
     others.others.clear();
-    for (hands, state, shown, place) in &bodies {
+    for (hands, state, visual, place) in &bodies {
         for hand in &hands.0 {
             let user = users.iter().find(|user| user.id == hand.user);
             let name = user.map_or_else(|| format!("user {}", hand.user.0), |user| user.name.clone());
-            let point =
-                place.affine().transform_point3(surface_point(state, hand.vertex, shown.current()).as_vec3());
+            let point = place
+                .affine()
+                .transform_point3(surface_point(state, hand.vertex, visual.current()).as_vec3());
             others.others.push(RecordedHand {
                 name: name.replace('/', " ").into(),
                 color: user.map(|user| srgb(user.color)),

@@ -23,7 +23,7 @@ use crate::{
 };
 
 /// Displacement with the last color of the scale, as a fraction of the body's size.
-const FULL_COLOUR: f32 = 0.3;
+const FULL_COLOR: f32 = 0.3;
 
 /// Stress with the last color of the scale, as a fraction of Young's modulus.
 const FULL_STRESS: f32 = 0.2;
@@ -36,7 +36,7 @@ const LAYOUT_PAUSE: Duration = Duration::from_millis(700);
 
 /// Colors of hands and series, which are also distinguishable with red-green color blindness (Okabe
 /// and Ito).
-const COLOURS: [[u8; 3]; 7] = [
+const COLORS: [[u8; 3]; 7] = [
     [230, 159, 0],
     [86, 180, 233],
     [0, 158, 115],
@@ -253,7 +253,7 @@ impl Recorder {
 
         self.positions.resize(surface.positions().len(), [0.0; 3]);
         model.basis().reconstruct(frame.coordinates(shape), shape.warped, &mut self.positions);
-        let full = FULL_COLOUR * model.size() as f32;
+        let full = FULL_COLOR * model.size() as f32;
         let mut largest = 0.0f32;
         let by_displacement = shape.draw && frame.color == RerunColor::Displacement;
         let mut colors = Vec::with_capacity(if shape.draw { self.positions.len() } else { 0 });
@@ -357,7 +357,7 @@ impl Recorder {
     fn hands(&mut self, hands: &[RecordedHand]) -> Result<(), RecordingStreamError> {
         let magnitude = |f: &[f64; 3]| f.iter().map(|x| x * x).sum::<f64>().sqrt();
         self.force = hands.iter().map(|hand| magnitude(&hand.force)).fold(self.force, f64::max);
-        let metres_a_newton = if self.force > 0.0 { LONGEST_ARROW * self.size / self.force } else { 0.0 };
+        let meters_per_newton = if self.force > 0.0 { LONGEST_ARROW * self.size / self.force } else { 0.0 };
         let single = |p: [f64; 3]| p.map(|x| x as f32);
         let color_at = |index: usize, hand: &RecordedHand| {
             hand.color.map_or_else(|| color_of(index), |[r, g, b]| Color::from_rgb(r, g, b))
@@ -375,7 +375,7 @@ impl Recorder {
         self.hand_columns.begin(self.now);
         for (index, hand) in hands.iter().enumerate() {
             self.hand_columns.push(
-                single(hand.force.map(|f| f * metres_a_newton)),
+                single(hand.force.map(|f| f * meters_per_newton)),
                 single(hand.point),
                 single(hand.target),
                 format!("{} {:.3} N", hand.name, magnitude(&hand.force)),
@@ -440,7 +440,7 @@ impl Recorder {
 }
 
 fn color_of(index: usize) -> Color {
-    let [r, g, b] = COLOURS[index % COLOURS.len()];
+    let [r, g, b] = COLORS[index % COLORS.len()];
     Color::from_rgb(r, g, b)
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 /// Number of exchanges that the estimate uses.
 const WINDOW: usize = 16;
-/// Slew rate of the offset towards a better estimate, as a share of the time that passes.
+/// Slew rate of the offset toward a better estimate, as a share of the time that passes.
 const SLEW: f64 = 0.01;
 /// Smallest offset error that counts as a clock jump, s, on top of half the round trip of the
 /// exchange.
@@ -14,7 +14,7 @@ const JUMP: f64 = 0.5;
 /// Estimates `host clock - own clock`.
 ///
 /// Of the last 16 exchanges, the one with the smallest round trip counts. The offset is slewed
-/// towards its value by at most 1 %.
+/// toward its value by at most 1 %.
 ///
 /// `offset = ((t2 - t1) + (t3 - t4)) / 2`, `round trip = (t4 - t1) - (t3 - t2)` (Mills, RFC 5905).
 #[derive(Debug, Clone, Default)]

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use nalgebra::Vector3;
 
 /// Most targets that wait. Older ones are dropped.
-const MOST_WAITING: usize = 64;
+const MAX_WAITING: usize = 64;
 /// Longest gap in targets that counts as a loss. A longer gap is a pause.
 const LONGEST_GAP: u32 = 8;
 /// Factor by which a correction fades per tick. After six ticks about a twentieth is left.
@@ -62,7 +62,7 @@ impl HandPlayout {
             self.queue.extend((1..step).map(|k| from.lerp(&target, f64::from(k) / f64::from(step))));
         }
         self.queue.push_back(target);
-        while self.queue.len() > MOST_WAITING {
+        while self.queue.len() > MAX_WAITING {
             self.queue.pop_front();
         }
     }
@@ -129,7 +129,7 @@ fn faded(offset: Vector3<f64>, most: f64) -> Vector3<f64> {
 mod tests {
     use super::*;
 
-    const MOST: f64 = 0.5;
+    const MAX: f64 = 0.5;
 
     /// A hand that moves on a circle, with 40 targets per second.
     fn circle(tick: u32) -> Vector3<f64> {
@@ -146,7 +146,7 @@ mod tests {
             for &(_, input) in arrivals.iter().filter(|(at, _)| *at == tick) {
                 hand.take(input, 1, circle(input));
             }
-            played.push(hand.next(depth, MOST));
+            played.push(hand.next(depth, MAX));
         }
         let jerk = |w: &[Vector3<f64>]| (w[0] - 2.0 * w[1] + w[2]).norm();
         let worst = played.windows(3).map(jerk).fold(0.0, f64::max);
@@ -204,15 +204,15 @@ mod tests {
         hand.take(1, 1, Vector3::x() * 1e6);
         let mut at = Vector3::zeros();
         for _ in 0..50 {
-            let next = hand.next(1, MOST);
-            assert!((next - at).norm() <= MOST * 1.000_001);
+            let next = hand.next(1, MAX);
+            assert!((next - at).norm() <= MAX * 1.000_001);
             at = next;
         }
         // Many more targets than may wait arrive, and the oldest are dropped.
         for input in 0..10_000 {
             hand.take(input, 1, circle(input));
         }
-        assert!(hand.queue.len() <= MOST_WAITING);
+        assert!(hand.queue.len() <= MAX_WAITING);
     }
 
     /// A resting guest sends its target six times and is then silent.
@@ -221,20 +221,20 @@ mod tests {
         let mut hand = HandPlayout::new(Vector3::zeros());
         for input in 0..5 {
             hand.take(input, 1, Vector3::x() * 0.01 * f64::from(input));
-            hand.next(1, MOST);
+            hand.next(1, MAX);
         }
         // A tick without a target is extrapolated, so the next target causes a correction that
         // fades.
-        hand.next(1, MOST);
+        hand.next(1, MAX);
         let end = Vector3::y() * 0.3;
         for input in 5..11 {
             hand.take(input, 1, end);
-            hand.next(1, MOST);
+            hand.next(1, MAX);
         }
         for _ in 0..40 {
-            hand.next(1, MOST);
+            hand.next(1, MAX);
         }
-        assert_eq!(hand.next(1, MOST), end);
+        assert_eq!(hand.next(1, MAX), end);
     }
 
     #[test]
@@ -242,22 +242,22 @@ mod tests {
         let mut hand = HandPlayout::new(Vector3::zeros());
         for input in 0..10 {
             hand.take(input, 1, Vector3::x() * 0.01 * f64::from(input));
-            hand.next(2, MOST);
+            hand.next(2, MAX);
         }
         for _ in 0..40 {
-            hand.next(2, MOST);
+            hand.next(2, MAX);
         }
         let end = Vector3::x() * 0.09;
         hand.take(10, 1, end);
         for _ in 0..60 {
-            hand.next(2, MOST);
+            hand.next(2, MAX);
         }
         // The hand went on a little when no target arrived, and then returned.
-        assert_eq!(hand.next(2, MOST), end);
+        assert_eq!(hand.next(2, MAX), end);
         for input in 11..80 {
             hand.take(input, 1, end);
-            hand.next(2, MOST);
+            hand.next(2, MAX);
         }
-        assert_eq!(hand.next(2, MOST), end);
+        assert_eq!(hand.next(2, MAX), end);
     }
 }

@@ -105,6 +105,6 @@ pub use session::{
     HostSessionConfig, LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand, StreamedBody,
 };
 pub use state::{
-    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, Pose, Role, State,
-    TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo,
+    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, RigidState, Role,
+    State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo,
 };

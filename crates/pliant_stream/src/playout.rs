@@ -8,7 +8,7 @@ use crate::state::Tick;
 
 /// Number of arrivals that the estimate uses.
 const WINDOW: usize = 128;
-/// Slew rate of the schedule towards the estimate, 1 %. Slewing keeps the change invisible.
+/// Slew rate of the schedule toward the estimate, 1 %. Slewing keeps the change invisible.
 const SLEW: f64 = 0.01;
 /// Error beyond which the estimate is adopted at once, s. It means that the path or the host's
 /// clock has jumped.
@@ -19,7 +19,7 @@ const LATE_ROW: usize = 8;
 const SHIFTED: f64 = 3.0;
 /// Smallest and largest margin for scattered arrivals on top of a fixed delay, ticks.
 const MARGIN: f64 = 0.25;
-const MOST_SCATTER: f64 = 2.0;
+const MAX_SCATTER: f64 = 2.0;
 /// Share of frames that may arrive too late.
 const LATE_SHARE: f64 = 0.02;
 
@@ -94,7 +94,7 @@ impl PlayoutClock {
             _ => 0.0,
         };
         let ticks = match self.playout {
-            Playout::Fixed(ticks) => f64::from(ticks) + late.clamp(MARGIN, MOST_SCATTER),
+            Playout::Fixed(ticks) => f64::from(ticks) + late.clamp(MARGIN, MAX_SCATTER),
             Playout::Adaptive(most) => (late + MARGIN).min(f64::from(most) + MARGIN),
         };
         earliest + ticks * self.h

@@ -10,7 +10,7 @@ use pliant_modal::{
 
 use crate::StreamError;
 use crate::prediction::{BodyCopy, HandState};
-use crate::state::{GrabKey, GrabState, Pose};
+use crate::state::{GrabKey, GrabState, RigidState};
 use crate::wire::FrameGrab;
 
 /// Largest number of cached patches. One more empties the table.
@@ -114,7 +114,7 @@ impl Replica {
         let velocity = way.map_or_else(Vector3::zeros, |way| way / self.kernel.h());
         let mut hand = Hand::new(patch, Hold::Target { target, velocity, config });
         if let Some(known) = known {
-            (hand.mean, hand.flow) = (known.mean, known.viscoelastic);
+            (hand.mean, hand.viscoelastic) = (known.mean, known.viscoelastic);
         }
         self.hold(key, hand);
     }
@@ -131,7 +131,7 @@ impl Replica {
                 Hold::Target { target, .. } => Some(target),
                 Hold::Measured(_) => None,
             };
-            HandState { key, pull: hand.pull, mean: hand.mean, target, viscoelastic: hand.flow }
+            HandState { key, pull: hand.pull, mean: hand.mean, target, viscoelastic: hand.viscoelastic }
         }));
     }
 
@@ -207,14 +207,18 @@ impl Replica {
 
     /// Brings the columns of held patches in a state to rest under the reactions (N, world axes) of
     /// hands on patches, given by vertex and radius (m).
-    pub(crate) fn settle(&mut self, state: &mut State, hands: impl Iterator<Item = (u32, f64, [f64; 3])>) {
+    pub(crate) fn equilibrate_columns(
+        &mut self,
+        state: &mut State,
+        hands: impl Iterator<Item = (u32, f64, [f64; 3])>,
+    ) {
         self.release_all();
         for (vertex, radius, reaction) in hands {
             let Some(patch) = self.patch(vertex, radius) else { continue };
             let hand = Hand::new(patch, Hold::Measured(Vector3::zeros()));
             self.hands.push(Hand { mean: -Vector3::from(reaction), ..hand });
         }
-        self.kernel.settle(state, &self.hands);
+        self.kernel.equilibrate_columns(state, &self.hands);
         self.release_all();
     }
 
@@ -254,7 +258,7 @@ pub(crate) fn fill(state: &mut State, from: [&[f64]; 4]) {
 }
 
 /// Sets the rigid frame of a state to a pose. Without a valid pose the frame stays.
-pub(crate) fn place(state: &mut State, model: &ModalModel, pose: Option<&Pose>) {
+pub(crate) fn place(state: &mut State, model: &ModalModel, pose: Option<&RigidState>) {
     if let Some(frame) = pose.and_then(|pose| pose.frame(model)) {
         state.frame = frame;
     }

@@ -173,7 +173,7 @@ impl fmt::Display for BodyId {
 
 /// The rigid frame of a free body: pose and twist, in world axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Pose {
+pub struct RigidState {
     /// Origin of the body's frame, m.
     pub position: [f64; 3],
     /// Orientation as a unit quaternion (x, y, z, w).
@@ -184,14 +184,14 @@ pub struct Pose {
     pub angular: [f64; 3],
 }
 
-impl Default for Pose {
+impl Default for RigidState {
     /// Returns the pose at the origin, unrotated and at rest.
     fn default() -> Self {
         Self { position: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0], linear: [0.0; 3], angular: [0.0; 3] }
     }
 }
 
-impl Pose {
+impl RigidState {
     /// Returns the pose of a body: the frame at the model's origin and its twist.
     pub fn of(body: &Body) -> Self {
         Self::of_frame(body.model(), body.frame())
@@ -278,7 +278,7 @@ pub struct TickState<'a> {
     /// elastic body.
     pub z: &'a [f64],
     /// The rigid frame of a free body; `None` for an anchored one.
-    pub pose: Option<Pose>,
+    pub pose: Option<RigidState>,
     /// All grabs of the body, at most [`MAX_GRABS`].
     pub grabs: &'a [GrabState],
     /// The body sleeps. The session sends nothing but a slow reminder until this is false again.

@@ -18,7 +18,7 @@ use pliant_stream::wire::{
 };
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
-    HostSessionConfig, Newmark, PeerId, Pose, RecoveryConfig, StepSettings, StreamError, TickState,
+    HostSessionConfig, Newmark, PeerId, RecoveryConfig, RigidState, StepSettings, StreamError, TickState,
 };
 use proptest::prelude::*;
 use support::bar;
@@ -28,13 +28,13 @@ fn quanta() -> Quanta {
     Quanta::new(&bar(12, 0.05), 12, &Newmark::average(0.025))
 }
 
-fn quantised(coding: AccelerationCoding, values: &[f64]) -> Accelerations {
-    Accelerations::quantise(coding, values, 1e-4, &quanta())
+fn quantized(coding: AccelerationCoding, values: &[f64]) -> Accelerations {
+    Accelerations::quantize(coding, values, 1e-4, &quanta())
 }
 
 fn sliced(payload: u8) -> Slice {
     let entry = |mode, q, v| SliceEntry { mode, q, v, load: 3.0, z: 0.5 * q };
-    Slice::quantise(&[entry(3, 1.0, 2.0), entry(9, -0.5, 0.0)], 1e-4, payload == 2, payload == 3, &quanta())
+    Slice::quantize(&[entry(3, 1.0, 2.0), entry(9, -0.5, 0.0)], 1e-4, payload == 2, payload == 3, &quanta())
 }
 
 fn samples() -> Vec<Datagram> {
@@ -51,11 +51,11 @@ fn samples() -> Vec<Datagram> {
         } else {
             vec![FrameGrab { displacement: [0.0; 3], ..grab(1) }]
         },
-        pose: (payload == 2).then(|| Pose { position: [1.0, 2.0, 3.0], ..Pose::default() }),
+        pose: (payload == 2).then(|| RigidState { position: [1.0, 2.0, 3.0], ..RigidState::default() }),
         accelerations: match payload {
-            1 => Some(quantised(AccelerationCoding::Visible, &[1.0, -2.0, 0.25])),
-            2 => Some(quantised(AccelerationCoding::F32, &[1.0, -2.0, 0.25])),
-            3 => Some(quantised(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
+            1 => Some(quantized(AccelerationCoding::Visible, &[1.0, -2.0, 0.25])),
+            2 => Some(quantized(AccelerationCoding::F32, &[1.0, -2.0, 0.25])),
+            3 => Some(quantized(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
             _ => None,
         },
         slice: (payload != 1).then(|| sliced(payload)),
@@ -67,7 +67,7 @@ fn samples() -> Vec<Datagram> {
                 reaction: [1.0, 2.0, 3.0],
                 displacement: if payload == 0 { [0.5, 0.5, 0.5] } else { [0.0; 3] },
             }],
-            accelerations: (payload == 1).then(|| quantised(AccelerationCoding::Visible, &[1.0, 0.0, 0.0])),
+            accelerations: (payload == 1).then(|| quantized(AccelerationCoding::Visible, &[1.0, 0.0, 0.0])),
         }],
     };
     let report = ReceiverReport { received: 10, highest: 12 };
@@ -366,7 +366,7 @@ fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
     for name in ["default", "paper"] {
         let (mut host, mut guest, mut now) = session(name);
         let Datagram::Frame(f) = &samples()[0] else { unreachable!() };
-        let accelerations = (name == "paper").then(|| quantised(AccelerationCoding::Visible, &[1.0; 12]));
+        let accelerations = (name == "paper").then(|| quantized(AccelerationCoding::Visible, &[1.0; 12]));
         let frame = TickFrame { tick: 900_000, accelerations, repeats: Vec::new(), ..f.clone() };
         guest.on_datagram(now, &Datagram::Frame(frame).encode(120));
         for tick in 60..160 {

@@ -9,7 +9,7 @@ use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::History;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
-    BodyId, GrabKey, GrabState, Newmark, Pose, RecoveryConfig, StepSettings, TickState, UserId,
+    BodyId, GrabKey, GrabState, Newmark, RecoveryConfig, RigidState, StepSettings, TickState, UserId,
 };
 use support::bar;
 
@@ -51,7 +51,8 @@ fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
                     (0..500).map(|k| -0.3 * (1.0 + k as f64) * (t * (1.0 + k as f64) + 0.7).sin()).collect();
                 // The number of hands goes from none to the maximum and jumps back to none.
                 let grabs = hands((tick * 13 % 65) as u16);
-                let pose = (tick % 3 == 0).then(|| Pose { position: [1.0, 2.0, 3.0], ..Pose::default() });
+                let pose = (tick % 3 == 0)
+                    .then(|| RigidState { position: [1.0, 2.0, 3.0], ..RigidState::default() });
                 let state =
                     TickState { tick, q: &q, v: &v, a: &a, z: &[], pose, grabs: &grabs, resting: false };
                 if tick == 1 {

@@ -92,11 +92,11 @@ fn asset(path: &[Step], file: &str, what: &str) -> Checked {
     if is_below(file) {
         return Ok(());
     }
-    let shown: String = file.chars().take(80).collect();
+    let excerpt: String = file.chars().take(80).collect();
     Err(fault(
         path,
         SceneErrorKind::Value,
-        format!("expected {what}, a path under the folder of assets, got {shown:?}"),
+        format!("expected {what}, a path under the folder of assets, got {excerpt:?}"),
     ))
 }
 
@@ -107,8 +107,8 @@ pub(super) fn check(scene: &SceneDescription) -> Checked {
     }
     if let Some(view) = scene.view {
         let at = |field| [Field("view"), Field(field)];
-        point(&at("middle"), "metres", &view.middle)?;
-        above_zero(&at("distance"), "metres", view.distance, LARGEST)?;
+        point(&at("middle"), "meters", &view.middle)?;
+        above_zero(&at("distance"), "meters", view.distance, LARGEST)?;
         within(&at("yaw"), "degrees", view.yaw, -3600.0..=3600.0)?;
         within(&at("pitch"), "degrees", view.pitch, -89.0..=89.0)?;
     }
@@ -135,7 +135,7 @@ fn bodies(scene: &SceneDescription) -> Result<HashMap<String, usize>, SceneFault
                 &copies.count.map(|n| n as f64),
                 &(1.0..=MAX_BODIES as f64),
             )?;
-            each(&inner("spacing"), "metres between rows", &copies.spacing, &(0.0..=LARGEST))?;
+            each(&inner("spacing"), "meters between rows", &copies.spacing, &(0.0..=LARGEST))?;
         }
         count = count.saturating_add(body.count());
         if count > MAX_BODIES {
@@ -177,9 +177,9 @@ fn made_of(scene: &SceneDescription, body: &BodyEntry, at: &dyn Fn(&'static str)
         (None, None) => Ok(()),
         (Some(model), None) => {
             if !model.to_ascii_lowercase().ends_with(".modal") {
-                let shown: String = model.chars().take(80).collect();
+                let excerpt: String = model.chars().take(80).collect();
                 let message = format!(
-                    "expected a baked body, a file that ends with .modal, got {shown:?}; `bake: (shape: ..)` bakes others"
+                    "expected a baked body, a file that ends with .modal, got {excerpt:?}; `bake: (shape: ..)` bakes others"
                 );
                 return Err(fault(&at("model"), SceneErrorKind::Value, message));
             }
@@ -211,7 +211,7 @@ fn made_of(scene: &SceneDescription, body: &BodyEntry, at: &dyn Fn(&'static str)
 
 fn settings(body: &BodyEntry, at: &dyn Fn(&'static str) -> [Step; 3]) -> Checked {
     let inner = |field, part| [at(field).as_slice(), &[Field(part)]].concat();
-    point(&inner("place", "at"), "metres", &body.place.at)?;
+    point(&inner("place", "at"), "meters", &body.place.at)?;
     each(&inner("place", "turn"), "degrees", &body.place.turn, &(-3600.0..=3600.0))?;
     within(&inner("place", "scale"), "a scale", body.place.scale, 1e-3..=1e3)?;
     each(&at("color"), "a part of red, green and blue", &body.color, &(0.0..=1.0))?;
@@ -271,9 +271,9 @@ fn grabs(scene: &SceneDescription, bodies: &HashMap<String, usize>) -> Checked {
 
 fn hold(grab: &GrabEntry, at: &dyn Fn(&'static str) -> [Step; 3]) -> Checked {
     if let Some(radius) = grab.radius {
-        within(&at("radius"), "metres", radius, 0.0..=LARGEST)?;
+        within(&at("radius"), "meters", radius, 0.0..=LARGEST)?;
     }
-    point(&at("pull"), "metres", &grab.pull)?;
+    point(&at("pull"), "meters", &grab.pull)?;
     motion(&at("motion"), &grab.motion)?;
     times(&at("from"), &at("until"), grab.from, grab.until, 0.0)?;
     within(&at("rise"), "seconds", grab.rise, 0.0..=LONGEST)?;
@@ -298,8 +298,8 @@ fn body_there(path: &[Step], who: &str, wanted: &str, bodies: &HashMap<String, u
     if bodies.contains_key(wanted) {
         return Ok(());
     }
-    let shown: String = wanted.chars().take(80).collect();
-    let mut message = format!("{who} a body `{shown}` that is not in the scene");
+    let excerpt: String = wanted.chars().take(80).collect();
+    let mut message = format!("{who} a body `{excerpt}` that is not in the scene");
     let mut all: Vec<&str> = bodies.keys().map(String::as_str).collect();
     all.sort_unstable();
     if let Some(near) = nearest(wanted, all.iter().copied()) {
@@ -317,7 +317,7 @@ fn body_there(path: &[Step], who: &str, wanted: &str, bodies: &HashMap<String, u
 fn patch(path: &[Step], patch: &PatchEntry) -> Checked {
     let inside = [path, &[Item(0)]].concat();
     match patch {
-        PatchEntry::Near(at) => point(&inside, "metres", at),
+        PatchEntry::Near(at) => point(&inside, "meters", at),
         PatchEntry::Toward(way) => {
             point(&inside, "a direction", way)?;
             if way.iter().any(|x| *x != 0.0) {
@@ -334,7 +334,7 @@ fn motion(path: &[Step], motion: &Motion) -> Checked {
     match motion {
         Motion::Still => Ok(()),
         Motion::Waves { size, hz } => {
-            point(&inside("size"), "metres", size)?;
+            point(&inside("size"), "meters", size)?;
             each(&inside("hz"), "Hz", hz, &(0.0..=100.0))
         }
         Motion::Path { points, .. } => {
@@ -349,7 +349,7 @@ fn motion(path: &[Step], motion: &Motion) -> Checked {
                     );
                     return Err(fault(&at("at"), SceneErrorKind::Value, message));
                 }
-                point(&at("to"), "metres", &entry.to)?;
+                point(&at("to"), "meters", &entry.to)?;
                 before = entry.at;
             }
             Ok(())
@@ -364,9 +364,9 @@ fn network(scene: &SceneDescription) -> Checked {
         match value.parse::<std::net::SocketAddr>() {
             Ok(_) => Ok(()),
             Err(_) => {
-                let shown: String = value.chars().take(80).collect();
+                let excerpt: String = value.chars().take(80).collect();
                 let message =
-                    format!("expected an address and a port, such as \"0.0.0.0:7400\", got {shown:?}");
+                    format!("expected an address and a port, such as \"0.0.0.0:7400\", got {excerpt:?}");
                 Err(fault(&at("listen"), SceneErrorKind::Value, message))
             }
         }
@@ -381,7 +381,7 @@ fn network(scene: &SceneDescription) -> Checked {
             let inner = |field| [Field("network"), Field("guest"), Field(field)];
             name(&inner("name"), &guest.name)?;
             network_link(&inner("link"), &guest.link)?;
-            point(&inner("beside"), "metres", &guest.beside)
+            point(&inner("beside"), "meters", &guest.beside)
         }
         Some(NetworkEntry::Join { invite: given, name: own, link }) => {
             name(&at("name"), own)?;
@@ -402,9 +402,9 @@ fn network_link(path: &[Step], link: &Option<String>) -> Checked {
     use crate::stream::emulator::Preset;
     let Some(link) = link.as_ref().filter(|link| Preset::by_name(link).is_none()) else { return Ok(()) };
     let names = Preset::ALL.map(Preset::name);
-    let shown: String = link.chars().take(80).collect();
+    let excerpt: String = link.chars().take(80).collect();
     let meant = nearest(link, names).map_or(String::new(), |near| format!("did you mean `{near}`? "));
-    let message = format!("no network is called {shown:?}; {meant}The networks are {}", names.join(", "));
+    let message = format!("no network is called {excerpt:?}; {meant}The networks are {}", names.join(", "));
     Err(fault(path, SceneErrorKind::Name, message))
 }
 
@@ -467,8 +467,9 @@ fn recording(scene: &SceneDescription) -> Checked {
     if is_below(file) && extension.is_some_and(|extension| extension == "rrd") {
         return Ok(());
     }
-    let shown: String = file.chars().take(80).collect();
-    let message = format!("expected a file that ends with .rrd, below the working directory, got {shown:?}");
+    let excerpt: String = file.chars().take(80).collect();
+    let message =
+        format!("expected a file that ends with .rrd, below the working directory, got {excerpt:?}");
     Err(fault(&at("file"), SceneErrorKind::Value, message))
 }
 

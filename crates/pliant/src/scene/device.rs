@@ -8,7 +8,7 @@ use super::spawn::{self, PartOf, SceneBody, SceneClock, SceneSource};
 use super::{DeviceEntry, Grip, Like, Motion, SceneError, SceneErrorKind, SceneFile, TouchEntry};
 use crate::body::{BodyState, PointerGrab};
 use crate::haptics::{
-    DeviceId, Hand, HapticDevice, HapticDevices, HapticTool, LoopConfig, PointerSource, Positioned,
+    DeviceId, HandModel, HapticDevice, HapticDevices, HapticTool, LoopConfig, PointerSource, Positioned,
     PositionedHandle, SafetyConfig, StaleConfig, ToolGrip, VirtualConfig, VirtualDevice, VirtualHandle,
 };
 
@@ -49,9 +49,9 @@ pub(super) fn add(
                 Like::Omega3 => VirtualConfig::omega3(),
             };
             let hand = match grip {
-                Grip::Firm => Hand::FIRM,
-                Grip::Light => Hand::LIGHT,
-                Grip::Loose => Hand::LOOSE,
+                Grip::Firm => HandModel::FIRM,
+                Grip::Light => HandModel::LIGHT,
+                Grip::Loose => HandModel::LOOSE,
             };
             let device = VirtualDevice::new(config, hand).map_err(|error| {
                 failed(SceneErrorKind::Open, format!("the device cannot be opened: {error}"))

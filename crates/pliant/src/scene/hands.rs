@@ -62,14 +62,14 @@ const RADIUS: f64 = 0.06;
 fn take_hold(
     entry: &GrabEntry,
     state: &BodyState,
-    shown: &VisualState,
+    visual: &VisualState,
     place: &GlobalTransform,
 ) -> Result<(u32, f64, DVec3), String> {
     let model = state.model();
     let vertex = vertex_of(&entry.patch, model)?;
     let radius = entry.radius.unwrap_or(RADIUS * model.size());
     let patch = Patch::around(model.surface(), vertex, radius).map_err(|error| error.to_string())?;
-    let positions = state.positions(shown);
+    let positions = state.positions(visual);
     let middle: DVec3 = patch
         .entries()
         .iter()
@@ -109,8 +109,8 @@ pub(super) fn play(
                 let body =
                     bodies.iter().find(|(_, name, of, ..)| of.0 == part.0 && name.as_str() == entry.body);
                 // The hand waits for a missing body, which may return within a session.
-                let Some((body, _, _, state, shown, place)) = body else { continue };
-                match take_hold(entry, state, shown, place) {
+                let Some((body, _, _, state, visual, place)) = body else { continue };
+                match take_hold(entry, state, visual, place) {
                     Ok((vertex, radius, from)) => {
                         let grab = Grab {
                             stiffness: entry.stiffness,

@@ -140,9 +140,9 @@ fn there(assets: &Path, file: &str) -> Result<(), String> {
         return Ok(());
     }
     let folder = path.parent().unwrap_or(assets);
-    let shown = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+    let excerpt = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let mut message = format!("there is no {name} in {}", shown.display());
+    let mut message = format!("there is no {name} in {}", excerpt.display());
     let mut others: Vec<String> = std::fs::read_dir(folder)
         .into_iter()
         .flatten()

@@ -170,14 +170,14 @@ fn publish_states(
     bodies: Query<(&Name, &VisualState, &BodyState, &Transform), With<SceneBody>>,
 ) {
     let mut seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
-    for (name, shown, state, place) in &bodies {
+    for (name, visual, state, place) in &bodies {
         let free = state
             .model()
             .is_free()
             .then(|| Pose { origin: place.translation.as_dvec3(), orientation: place.rotation.as_dquat() });
         let entry = seen.entry(name.as_str().to_owned()).or_default();
         entry.0.clear();
-        entry.0.extend_from_slice(shown.q());
+        entry.0.extend_from_slice(visual.q());
         entry.1 = free;
     }
 }
@@ -244,18 +244,18 @@ fn lend(
 
 fn show(seen: Res<LastStates>, mut views: Query<(&mut GuestsView, &mut VisualState)>) {
     let seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
-    for (mut view, mut shown) in &mut views {
-        let Some((q, pose)) = seen.get(&view.name).filter(|(q, _)| q.len() == shown.q().len()) else {
+    for (mut view, mut visual) in &mut views {
+        let Some((q, pose)) = seen.get(&view.name).filter(|(q, _)| q.len() == visual.q().len()) else {
             continue;
         };
         // A resting body must not be drawn, uploaded and recorded again.
-        if shown.current() == q.as_slice() && view.pose == *pose {
+        if visual.current() == q.as_slice() && view.pose == *pose {
             continue;
         }
         view.pose = *pose;
         let written = match pose {
-            None => shown.snap(q),
-            Some(pose) => shown.push_at(q, Pose { origin: pose.origin + view.beside, ..*pose }),
+            None => visual.snap(q),
+            Some(pose) => visual.push_at(q, Pose { origin: pose.origin + view.beside, ..*pose }),
         };
         if let Err(error) = written {
             warn_once!("{error}");

@@ -12,16 +12,16 @@ pub(super) fn refused(origin: &str, text: &str, error: &SpannedError) -> SceneEr
         |outer: &Option<String>| outer.as_ref().map_or(String::new(), |outer| format!(" in {outer}"));
     let listed = |names: &[&str]| names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
     let wrong = |what: &str, found: &str, outer: &Option<String>, names: &'static [&'static str]| {
-        let shown: String = found.chars().take(80).collect();
+        let excerpt: String = found.chars().take(80).collect();
         let names_there = listed(names);
         match nearest(found, names.iter().copied()) {
             Some(near) => {
                 format!(
-                    "unknown {what} `{shown}`{}; did you mean `{near}`? There are {names_there}",
+                    "unknown {what} `{excerpt}`{}; did you mean `{near}`? There are {names_there}",
                     inside(outer)
                 )
             }
-            None => format!("unknown {what} `{shown}`{}; expected one of {names_there}", inside(outer)),
+            None => format!("unknown {what} `{excerpt}`{}; expected one of {names_there}", inside(outer)),
         }
     };
     let (kind, message) = match &error.code {

@@ -42,7 +42,7 @@ struct BakeShared {
     /// The number of the stage in the upper half, the stage's progress in millionths in the lower
     /// half.
     progress: AtomicU64,
-    cancelled: AtomicBool,
+    canceled: AtomicBool,
 }
 
 const STAGES: [BakeStage; 6] = [
@@ -60,8 +60,8 @@ impl BakeShared {
         self.progress.store(stage << 32 | millionths, Ordering::Relaxed);
     }
 
-    fn is_cancelled(&self) -> bool {
-        self.cancelled.load(Ordering::Relaxed)
+    fn is_canceled(&self) -> bool {
+        self.canceled.load(Ordering::Relaxed)
     }
 }
 
@@ -77,7 +77,7 @@ impl BakeJob {
 
     pub fn cancel(&mut self) {
         self.entity = None;
-        self.shared.cancelled.store(true, Ordering::Relaxed);
+        self.shared.canceled.store(true, Ordering::Relaxed);
     }
 
     pub fn poll(&mut self) -> Option<Outcome> {
@@ -109,7 +109,7 @@ fn run(
         .map_err(|error| BakeBodyError::Threads(error.to_string()))?;
     threads.install(|| {
         let (mesh, skin, repair) = mesh(request, shared)?;
-        if shared.is_cancelled() {
+        if shared.is_canceled() {
             return Ok(Outcome::Cancelled);
         }
         let mut progress = |stage, share| {

@@ -82,7 +82,7 @@ struct CameraView {
     near: f32,
     /// Meters that a pixel covers: at a distance of one meter in perspective, anywhere in an
     /// orthographic view.
-    metres: f32,
+    meters: f32,
     perspective: bool,
 }
 
@@ -93,15 +93,15 @@ impl Views {
             let height = camera.physical_viewport_size()?.y as f32;
             let matrix = camera.clip_from_view();
             // Half of the picture's height is one unit of clip space.
-            let metres = 2.0 / (matrix.y_axis.y.abs() * height);
+            let meters = 2.0 / (matrix.y_axis.y.abs() * height);
             let perspective = matrix.w_axis.w == 0.0;
             // In a reversed-depth projection without a far plane, the last column holds the near
             // distance.
             let near = if perspective { matrix.w_axis.z.abs().max(1e-6) } else { 0.0 };
-            (camera.is_active && metres.is_finite() && metres > 0.0).then_some(CameraView {
+            (camera.is_active && meters.is_finite() && meters > 0.0).then_some(CameraView {
                 eye: place.translation_vec3a(),
                 near,
-                metres,
+                meters,
                 perspective,
             })
         };
@@ -110,7 +110,7 @@ impl Views {
 
     /// Returns the meters (world) that a pixel covers at the nearest point of the body, as the
     /// least over all views. Returns `None` if there is no view.
-    pub fn metres_per_pixel(&self, bounds: &Aabb, place: &GlobalTransform) -> Option<f32> {
+    pub fn meters_per_pixel(&self, bounds: &Aabb, place: &GlobalTransform) -> Option<f32> {
         let affine = place.affine();
         let center = affine.transform_point3a(bounds.center);
         let radius = place.radius_vec3a(bounds.half_extents);
@@ -118,7 +118,7 @@ impl Views {
             .iter()
             .map(|view| {
                 let distance = (center.distance(view.eye) - radius).max(view.near);
-                if view.perspective { view.metres * distance } else { view.metres }
+                if view.perspective { view.meters * distance } else { view.meters }
             })
             .reduce(f32::min)
     }

@@ -117,7 +117,7 @@ fn make_meshes(
     mut meshes: ResMut<Assets<Mesh>>,
     bodies: Query<(Entity, &BodyState, &VisualState, &SurfaceShading, Option<&DrawnSurface>)>,
 ) {
-    for (entity, state, shown, shading, drawn) in &bodies {
+    for (entity, state, visual, shading, drawn) in &bodies {
         let model = state.model();
         // The comparison uses bits, so that a NaN angle equals the same NaN in the next frame.
         let same = |drawn: &DrawnSurface| {
@@ -129,10 +129,10 @@ fn make_meshes(
         let drawing = drawings.get(model, shading.crease);
         let mut scratch = cpu::Scratch::default();
         let mut mesh = new_mesh(model, &drawing.topology);
-        let detail = Detail { modes: shown.q().len(), warped: state.warps() };
+        let detail = Detail { modes: visual.q().len(), warped: state.warps() };
         let mut q = Vec::new();
-        shown.draw(&mut q);
-        let shape = cpu::Shape { q: &q, warped: state.warps(), held: held(shown) };
+        visual.draw(&mut q);
+        let shape = cpu::Shape { q: &q, warped: state.warps(), held: held(visual) };
         let topology = &drawing.topology;
         let bounds = cpu::write(model, state.precision(), topology, &shape, &mut mesh, &mut scratch);
         let mesh = meshes.add(mesh);
@@ -146,7 +146,7 @@ fn make_meshes(
                     model: model.clone(),
                     drawing,
                     crease: shading.crease,
-                    version: shown.version(),
+                    version: visual.version(),
                     detail,
                     computed: false,
                 },
@@ -173,15 +173,15 @@ fn take_down(
 }
 
 /// The own shapes of held patches in the shown state, with their coordinates.
-fn held(shown: &VisualState) -> Option<(&HeldShapes, &[f64])> {
-    shown.held().map(|(shapes, s)| (&**shapes, s))
+fn held(visual: &VisualState) -> Option<(&HeldShapes, &[f64])> {
+    visual.held().map(|(shapes, s)| (&**shapes, s))
 }
 
 /// Writes the displacements by held patches' own shapes. Returns the longest, m.
-fn write_moved(shown: &VisualState, out: &mut Vec<[f32; 4]>) -> f32 {
+fn write_moved(visual: &VisualState, out: &mut Vec<[f32; 4]>) -> f32 {
     out.clear();
     let mut longest = 0.0f32;
-    if let Some((shapes, s)) = held(shown) {
+    if let Some((shapes, s)) = held(visual) {
         out.extend(shapes.vertices().iter().zip(shapes.displacements(s)).map(|(&vertex, [x, y, z])| {
             longest = longest.max(Vec3::new(x, y, z).length());
             // The numbers of a surface's vertices are exact in single precision.
@@ -241,7 +241,7 @@ fn deform_surfaces(
     let mut written = false;
     let Scratch { cpu: scratch, q, moved: moved_by_hands } = &mut *scratch;
     let views = Views::new(cameras.iter());
-    for (entity, state, shown, allowed, place, mesh, mut drawn, shape, mut aabb, inherited, view) in
+    for (entity, state, visual, allowed, place, mesh, mut drawn, shape, mut aabb, inherited, view) in
         &mut bodies
     {
         if !inherited.get() || !Arc::ptr_eq(&drawn.model, state.model()) {
@@ -252,13 +252,13 @@ fn deform_surfaces(
             (SurfaceDeformation::Compute, Some(compute)) => compute.takes(&drawn.drawing),
             _ => false,
         };
-        let moved = drawn.version != shown.version() || compute != drawn.computed;
-        let full = Detail { modes: shown.q().len(), warped: state.warps() };
+        let moved = drawn.version != visual.version() || compute != drawn.computed;
+        let full = Detail { modes: visual.q().len(), warped: state.warps() };
         if !moved && drawn.detail.covers(full) {
             continue;
         }
-        shown.draw(q);
-        let longest = write_moved(shown, moved_by_hands);
+        visual.draw(q);
+        let longest = write_moved(visual, moved_by_hands);
         let bounds = || {
             let Aabb { center, half_extents } = drawn.drawing.bounds(q);
             Aabb { center, half_extents: half_extents + longest }
@@ -269,9 +269,9 @@ fn deform_surfaces(
             aabb.set_if_neq(bounds());
             continue;
         }
-        let detail = match views.metres_per_pixel(&aabb, place) {
-            Some(metres) => {
-                let error = f64::from(metres * allowed.tolerance.max(0.0)) / state.scale();
+        let detail = match views.meters_per_pixel(&aabb, place) {
+            Some(meters) => {
+                let error = f64::from(meters * allowed.tolerance.max(0.0)) / state.scale();
                 Detail::needed(&drawn.drawing, q, full.warped, error)
             }
             // No camera sees the body, only a light, or this is a test.
@@ -306,14 +306,14 @@ fn deform_surfaces(
                 commands.entity(entity).try_remove::<GpuShape>();
             }
             let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
-            let shape = cpu::Shape { q: kept, warped: detail.warped, held: held(shown) };
+            let shape = cpu::Shape { q: kept, warped: detail.warped, held: held(visual) };
             let topology = &drawn.drawing.topology;
             let bounds = cpu::write(&drawn.model, state.precision(), topology, &shape, &mut mesh, scratch);
             if let Some(bounds) = bounds {
                 aabb.set_if_neq(bounds);
             }
         }
-        drawn.version = shown.version();
+        drawn.version = visual.version();
         drawn.detail = detail;
         drawn.computed = compute;
         written = true;

@@ -74,10 +74,10 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
     let change = (with - without).length() / without.length();
     assert!((0.003..0.2).contains(&change), "{with} N with and {without} N without shapes");
     // The surface that is shown is the body's own.
-    let shown = app.world().get::<VisualState>(body).unwrap();
-    let (shapes, s) = shown.held().unwrap();
+    let visual = app.world().get::<VisualState>(body).unwrap();
+    let (shapes, s) = visual.held().unwrap();
     assert!(shapes.patches().len() == 1 && s.iter().any(|s| *s != 0.0));
-    let positions = state(&app, body).positions(shown);
+    let positions = state(&app, body).positions(visual);
     let mut solver = state(&app, body).body().clone();
     let mut want = positions.clone();
     solver.reconstruct(&mut want).unwrap();
@@ -85,7 +85,7 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
     let most = positions.iter().zip(&want).map(|(a, b)| off(a, b)).fold(0.0, f32::max);
     assert!(most < 1e-6, "the shown surface is {most} m off");
     // Without the columns it would not be.
-    let bare = state(&app, body).positions_at(shown.q());
+    let bare = state(&app, body).positions_at(visual.q());
     let dent = bare.iter().zip(&want).map(|(a, b)| off(a, b)).fold(0.0, f32::max);
     assert!(dent > 1e-4, "the columns move the surface by {dent} m");
     // They go with the hand, and the next hand on the patch need not wait.

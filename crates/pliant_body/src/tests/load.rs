@@ -33,7 +33,7 @@ fn a_thousand_bodies_at_rest_are_neither_stepped_nor_shown_anew_and_one_that_is_
         let mut query = app.world_mut().query::<(&BodyState, &VisualState)>();
         query
             .iter(app.world())
-            .map(|(state, shown)| (state.body().state().clone(), shown.version()))
+            .map(|(state, visual)| (state.body().state().clone(), visual.version()))
             .collect::<Vec<_>>()
     };
     let before = states(&mut app);

@@ -48,8 +48,8 @@ fn scene() -> (App, Entity, Entity) {
 /// Where `at` is in the window. `at` is in meters from the middle of the view in the plane z = 0.1,
 /// two meters in front of the camera.
 fn location(app: &App, window: Entity, at: Vec2) -> Location {
-    let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
-    let position = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
+    let pixels_a_meter = 300.0 / (2.0 * 0.5f32.tan());
+    let position = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_meter;
     assert!(app.world().get::<Window>(window).is_some());
     let target = RenderTarget::Window(WindowRef::Entity(window)).normalize(None);
     Location { target: target.unwrap_or(NormalizedRenderTarget::None { width: 0, height: 0 }), position }

@@ -153,12 +153,12 @@ fn the_picture_stands_between_the_last_two_steps() {
     let mut seen = Vec::new();
     for _ in 0..8 {
         app.update();
-        let shown = app.world().get::<VisualState>(body).unwrap();
+        let visual = app.world().get::<VisualState>(body).unwrap();
         let fraction = app.world().resource::<Time<Fixed>>().overstep_fraction_f64();
-        let expected = shown.previous()[0] + (shown.current()[0] - shown.previous()[0]) * fraction;
-        assert_eq!(shown.q()[0], expected, "at {fraction} of a step");
-        assert_eq!(shown.current(), state(&app, body).body().q());
-        seen.push(shown.q()[0]);
+        let expected = visual.previous()[0] + (visual.current()[0] - visual.previous()[0]) * fraction;
+        assert_eq!(visual.q()[0], expected, "at {fraction} of a step");
+        assert_eq!(visual.current(), state(&app, body).body().q());
+        seen.push(visual.q()[0]);
     }
     assert!(seen.windows(2).all(|w| w[1] < w[0]), "it falls in every frame: {seen:?}");
 }
@@ -173,22 +173,22 @@ fn a_remote_body_shows_what_is_pushed_and_is_not_stepped() {
 
     app.add_systems(
         FixedUpdate,
-        (|mut shown: Single<&mut VisualState>, tick: Res<crate::PliantTick>| {
-            shown.push(&[tick.0 as f64, 0.0, 0.0, 0.0]).unwrap();
+        (|mut visual: Single<&mut VisualState>, tick: Res<crate::PliantTick>| {
+            visual.push(&[tick.0 as f64, 0.0, 0.0, 0.0]).unwrap();
         })
         .in_set(PliantSystems::Publish),
     );
     frames_of(&mut app, 0.5);
     steps(&mut app, 9);
-    let shown = app.world().get::<VisualState>(body).unwrap();
+    let visual = app.world().get::<VisualState>(body).unwrap();
     let fraction = app.world().resource::<Time<Fixed>>().overstep_fraction_f64();
-    assert_eq!(shown.q()[0], (tick(&app) - 1) as f64 + fraction);
+    assert_eq!(visual.q()[0], (tick(&app) - 1) as f64 + fraction);
 
-    let mut shown = app.world_mut().get_mut::<VisualState>(body).unwrap();
-    assert!(shown.push(&[0.0; 3]).unwrap_err().to_string().contains("needs 4 modal coordinates, got 3"));
-    assert!(shown.push(&[0.0, f64::NAN, 0.0, 0.0]).unwrap_err().to_string().contains("modal coordinate 1"));
-    assert!(shown.push_at(&[0.0; 4], Pose { origin: DVec3::NAN, orientation: Default::default() }).is_err());
-    assert!(shown.current()[0] > 0.0, "what was refused changed nothing");
+    let mut visual = app.world_mut().get_mut::<VisualState>(body).unwrap();
+    assert!(visual.push(&[0.0; 3]).unwrap_err().to_string().contains("needs 4 modal coordinates, got 3"));
+    assert!(visual.push(&[0.0, f64::NAN, 0.0, 0.0]).unwrap_err().to_string().contains("modal coordinate 1"));
+    assert!(visual.push_at(&[0.0; 4], Pose { origin: DVec3::NAN, orientation: Default::default() }).is_err());
+    assert!(visual.current()[0] > 0.0, "what was refused changed nothing");
 }
 
 #[test]
@@ -202,8 +202,8 @@ fn in_another_schedule_the_step_is_the_frame() {
     steps(&mut app, 9);
     assert_eq!(tick(&app), 10, "the first update of an app has no time in it");
     assert_eq!(state(&app, body).body().config().step, 0.005);
-    let shown = app.world().get::<VisualState>(body).unwrap();
-    assert_eq!(shown.q(), state(&app, body).body().q());
+    let visual = app.world().get::<VisualState>(body).unwrap();
+    assert_eq!(visual.q(), state(&app, body).body().q());
 }
 
 #[test]

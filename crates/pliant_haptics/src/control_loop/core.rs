@@ -88,7 +88,7 @@ pub enum StartError {
 
 /// Input and output of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Tick {
+pub struct LoopTick {
     /// Time on the loop's clock, s.
     pub now: f64,
     /// Position of the hand, m, device axes.
@@ -119,7 +119,7 @@ pub struct Tick {
     pub silent: f64,
 }
 
-impl Default for Tick {
+impl Default for LoopTick {
     fn default() -> Self {
         Self {
             now: 0.0,
@@ -162,7 +162,7 @@ pub struct LoopCore {
     stalled_until: f64,
     stall: f64,
     stop: bool,
-    last: Tick,
+    last: LoopTick,
 }
 
 impl LoopCore {
@@ -209,7 +209,7 @@ impl LoopCore {
             stalled_until: f64::NEG_INFINITY,
             stall: 0.0,
             stop: false,
-            last: Tick::default(),
+            last: LoopTick::default(),
             coupling,
             info,
             config,
@@ -232,7 +232,7 @@ impl LoopCore {
     }
 
     /// Returns the input and output of the last tick.
-    pub fn last(&self) -> &Tick {
+    pub fn last(&self) -> &LoopTick {
         &self.last
     }
 
@@ -304,7 +304,7 @@ impl LoopCore {
     fn run(&mut self, now: f64, dt: f64, hand: Believed, model: &LocalModel) -> Wrench {
         let moved = if hand.jumped { Vector3::zeros() } else { hand.position - self.last_position };
         self.last_position = hand.position;
-        self.tool.follow(hand.position, hand.velocity, hand.orientation, hand.buttons, hand.shifted);
+        self.tool.update(hand.position, hand.velocity, hand.orientation, hand.buttons, hand.shifted);
 
         let mut fault = hand.fault;
         if dt > STALL {
@@ -321,7 +321,7 @@ impl LoopCore {
         let holding = self.good && self.received_tick > 0 && model.count > 0;
         let silent = if holding { (now - self.received_at).max(0.0) } else { 0.0 };
 
-        let felt = if holding {
+        let forces = if holding {
             let when = When { now, dt, period: 1.0 / self.config.rate };
             self.held.forces(when, hand.fault.is_none(), &self.tool, model)
         } else {
@@ -331,8 +331,8 @@ impl LoopCore {
         let scale = self.tool.energy_scale();
         let axes = self.info.force_axes;
         let [elastic, damping, weight] = [
-            self.tool.force_to_hand(felt.elastic),
-            self.tool.force_to_hand(felt.damping),
+            self.tool.force_to_hand(forces.elastic),
+            self.tool.force_to_hand(forces.damping),
             self.tool.weight(),
         ]
         .map(|force| masked(force, axes));
@@ -344,10 +344,10 @@ impl LoopCore {
             elastic,
             damping,
             weight,
-            stored: scale * felt.stored,
+            stored: scale * forces.stored,
             partial: model.partial,
             supplied: scale * supplied,
-            growing: felt.growing,
+            growing: forces.growing,
             holding,
             silent,
             interval: model.interval,
@@ -356,10 +356,10 @@ impl LoopCore {
         });
         let asked = (elastic + damping + weight).norm();
         let share = if asked > 1e-9 { (allowed.force.norm() / asked).min(1.0) } else { 1.0 };
-        let torque = self.torque_to_hand(&felt, dt, allowed.gain, share);
+        let torque = self.torque_to_hand(&forces, dt, allowed.gain, share);
         let wrench = Wrench { force: allowed.force.into(), torque: torque.into() };
         let orientation = self.tool.orientation.quaternion();
-        self.last = Tick {
+        self.last = LoopTick {
             now,
             position: hand.position.into(),
             velocity: hand.velocity.into(),
@@ -369,7 +369,7 @@ impl LoopCore {
             clutched: self.tool.is_clutched(),
             buttons: hand.buttons,
             wrench,
-            wanted: self.tool.force_to_hand(felt.elastic + felt.damping).into(),
+            wanted: self.tool.force_to_hand(forces.elastic + forces.damping).into(),
             gain: allowed.gain,
             port: allowed.port,
             fault: if self.safety.is_stopped() {
@@ -414,13 +414,13 @@ impl LoopCore {
     /// Beyond that, the torque is only clamped and slewed. Its work is not counted at the port, and
     /// its stiffness is not limited to what the device renders stably. Devices that exert real
     /// forces therefore get no torque.
-    fn torque_to_hand(&mut self, felt: &PatchForces, dt: f64, gain: f64, share: f64) -> Vector3<f64> {
+    fn torque_to_hand(&mut self, forces: &PatchForces, dt: f64, gain: f64, share: f64) -> Vector3<f64> {
         if !self.info.simulated || gain <= 0.0 {
             self.torque = Slew::default();
             return Vector3::zeros();
         }
         let peak = self.info.peak_torque;
-        let torque = masked(self.tool.torque_to_hand(felt.torque), self.info.torque_axes);
+        let torque = masked(self.tool.torque_to_hand(forces.torque), self.info.torque_axes);
         let torque = if torque.iter().all(|x| x.is_finite()) {
             clamp_magnitude(&(torque * share.min(gain)), peak)
         } else {

@@ -123,9 +123,9 @@ impl Coupling {
     /// coupling is, or if the scales make the force at the hand zero. A coupling of 0 N/m becomes
     /// 1e-6 N/m.
     pub fn grab_config(&self, motion_scale: f64, force_scale: f64) -> pliant_modal::GrabConfig {
-        let felt = motion_scale * motion_scale * force_scale;
+        let gain = motion_scale * motion_scale * force_scale;
         // A stiffness of zero with a scale of zero must give 0 and not NaN.
-        let stiffness = if self.stiffness > 0.0 { self.stiffness / felt } else { 0.0 };
+        let stiffness = if self.stiffness > 0.0 { self.stiffness / gain } else { 0.0 };
         pliant_modal::GrabConfig {
             stiffness: (!stiffness.is_infinite()).then_some(stiffness.max(WEAKEST)),
             relaxation: if self.stiffness.is_finite() && self.stiffness > 0.0 {

@@ -4,8 +4,8 @@
 use std::time::Instant;
 
 use crate::{
-    Calibration, Coupling, Fault, HapticDevice, Histogram, LocalModel, LoopConfig, LoopCore, ModalLocal,
-    Sample, Scheduler, StartError, Tick, ToolMap, Wrench,
+    Calibration, Coupling, Fault, HapticDevice, Histogram, LocalModel, LoopConfig, LoopCore, LoopTick,
+    ModalLocal, Sample, Scheduler, StartError, ToolMap, Wrench,
 };
 
 /// Time of continuous driver errors after which a device counts as lost, s.
@@ -40,7 +40,7 @@ pub enum LoopState {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LoopReport {
     /// The newest tick.
-    pub tick: Tick,
+    pub tick: LoopTick,
     /// State of the loop and its device.
     pub state: LoopState,
     /// Number of periods so far.

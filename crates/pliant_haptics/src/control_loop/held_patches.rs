@@ -135,7 +135,7 @@ impl HeldPatches {
     /// Returns the forces of this tick. `well` says whether the hand's position is valid, so that
     /// the loop's own body may follow it.
     pub(crate) fn forces(&mut self, when: When, well: bool, tool: &Tool, model: &LocalModel) -> PatchForces {
-        let mut felt = PatchForces { stored: model.stored, ..PatchForces::default() };
+        let mut forces = PatchForces { stored: model.stored, ..PatchForces::default() };
         let stepped = match &mut self.modal {
             Some(modal) if well => {
                 let steps = (when.dt / when.period).round().clamp(1.0, 4.0) as usize;
@@ -145,7 +145,7 @@ impl HeldPatches {
         };
         let modal = self.modal.as_deref().filter(|_| stepped);
         if let Some(modal) = modal {
-            felt.stored = modal.energy();
+            forces.stored = modal.energy();
         }
         let dt = when.dt.min(2.0 * when.period);
         for (i, (contact, slot)) in model.contacts().iter().zip(&mut self.slots).enumerate() {
@@ -156,43 +156,43 @@ impl HeldPatches {
             let stored = |stretch: Vector3<f64>| 0.5 * stretch.dot(&(k * stretch)).max(0.0);
             let (elastic, damping) = match modal {
                 Some(modal) => {
-                    felt.stored += modal.proxy(i).map_or(0.0, |proxy| stored(at - proxy));
+                    forces.stored += modal.proxy(i).map_or(0.0, |proxy| stored(at - proxy));
                     (modal.reaction(i), Vector3::zeros())
                 }
                 None => {
-                    felt.stored += stored(at - proxy);
+                    forces.stored += stored(at - proxy);
                     (-(k * (at - proxy)), -(tool.velocity - speed) * contact.damping)
                 }
             };
             slot.share = (slot.share + self.ramp.map_or(1.0, |ramp| dt / ramp)).min(1.0);
-            felt.growing |= slot.share < 1.0;
-            felt.elastic += elastic * slot.share;
-            felt.damping += damping * slot.share;
-            felt.torque += arm.cross(&(elastic + damping)) * slot.share;
+            forces.growing |= slot.share < 1.0;
+            forces.elastic += elastic * slot.share;
+            forces.damping += damping * slot.share;
+            forces.torque += arm.cross(&(elastic + damping)) * slot.share;
         }
         if tool.is_clutched() {
             // The clutch detaches the tool from the hand, so the body must not drag the hand. The
             // held patches stay where they are.
-            (felt.elastic, felt.damping, felt.torque) = Default::default();
+            (forces.elastic, forces.damping, forces.torque) = Default::default();
             self.rest();
-            return felt;
+            return forces;
         }
-        self.blend(&mut felt, dt);
-        felt
+        self.blend(&mut forces, dt);
+        forces
     }
 
-    fn blend(&mut self, felt: &mut PatchForces, dt: f64) {
+    fn blend(&mut self, forces: &mut PatchForces, dt: f64) {
         if std::mem::take(&mut self.swapped) {
-            self.offset = [self.last[0] - felt.elastic - felt.damping, self.last[1] - felt.torque];
+            self.offset = [self.last[0] - forces.elastic - forces.damping, self.last[1] - forces.torque];
             // An offset that is not finite is discarded.
             self.left = if self.offset.iter().flatten().all(|x| x.is_finite()) { 1.0 } else { 0.0 };
         }
         if self.left > 0.0 {
             self.left = (self.left - dt / BLEND).max(0.0);
-            felt.elastic += self.offset[0] * self.left;
-            felt.torque += self.offset[1] * self.left;
-            felt.growing = true;
+            forces.elastic += self.offset[0] * self.left;
+            forces.torque += self.offset[1] * self.left;
+            forces.growing = true;
         }
-        self.last = [felt.elastic + felt.damping, felt.torque];
+        self.last = [forces.elastic + forces.damping, forces.torque];
     }
 }

@@ -12,7 +12,7 @@ pub const MAX_CONTACTS: usize = 4;
 /// One grab as the loop sees it: a spring from a point of the tool to the *proxy*, the position of
 /// the held patch.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Contact {
+pub struct ToolContact {
     /// Key of the grab, unique for as long as the grab lasts. A contact with another key is another
     /// grab, and its force rises by a ramp.
     pub key: u64,
@@ -46,7 +46,7 @@ pub struct LocalModel {
     /// unknown.
     pub interval: f64,
     /// The contacts. The first `count` are in use.
-    pub contacts: [Contact; MAX_CONTACTS],
+    pub contacts: [ToolContact; MAX_CONTACTS],
     /// Number of grabs that the tool holds.
     pub count: usize,
     /// Energy that the body could give back, elastic and kinetic, J.
@@ -64,7 +64,7 @@ pub struct LocalModel {
 
 impl LocalModel {
     /// Returns the contacts in use.
-    pub fn contacts(&self) -> &[Contact] {
+    pub fn contacts(&self) -> &[ToolContact] {
         &self.contacts[..self.count.min(MAX_CONTACTS)]
     }
 
@@ -142,8 +142,8 @@ impl ModelWriter {
     ///
     /// - `held`: the tool's grabs, of which the first [`MAX_CONTACTS`] count.
     /// - `scale`: factor from the body's lengths and forces to those of the world.
-    /// - `stamp`: the [`Tick::now`](crate::Tick::now) of the tool position that was the target of
-    ///   the step.
+    /// - `stamp`: the [`LoopTick::now`](crate::LoopTick::now) of the tool position that was the
+    ///   target of the step.
     ///
     /// The proxy is the position of the patch in the solver. At the target of the step, the spring
     /// therefore gives exactly the reaction: `C lambda = target - proxy`.
@@ -196,7 +196,7 @@ impl ModelWriter {
             } else {
                 0.0
             };
-            out.contacts[i] = Contact {
+            out.contacts[i] = ToolContact {
                 key: grab.key,
                 offset: grab.offset,
                 proxy: proxy.into(),
@@ -223,7 +223,7 @@ impl ModelWriter {
     /// grabs.
     pub fn write_forces(
         &mut self,
-        felt: &[PublishedGrab],
+        published: &[PublishedGrab],
         relaxation: f64,
         stored: f64,
         period: f64,
@@ -234,10 +234,10 @@ impl ModelWriter {
         out.tick = self.tick;
         out.stamp = stamp;
         out.period = period;
-        out.count = felt.len().min(MAX_CONTACTS);
+        out.count = published.len().min(MAX_CONTACTS);
         let before = self.points;
         self.points = [None; MAX_CONTACTS];
-        for (i, grab) in felt.iter().take(MAX_CONTACTS).enumerate() {
+        for (i, grab) in published.iter().take(MAX_CONTACTS).enumerate() {
             let point = Vector3::from(grab.point);
             let last = before.iter().flatten().find(|(key, _)| *key == grab.key).map(|(_, p)| *p);
             let moved = last.map_or_else(Vector3::zeros, |p| point - p);
@@ -245,7 +245,7 @@ impl ModelWriter {
             let velocity = moved / period;
             let k = grab.stiffness;
             let k = if k.iter().flatten().all(|x| x.is_finite()) { k } else { [[0.0; 3]; 3] };
-            out.contacts[i] = Contact {
+            out.contacts[i] = ToolContact {
                 key: grab.key,
                 offset: grab.offset,
                 proxy: grab.point,

@@ -3,7 +3,7 @@
 
 use nalgebra::Vector3;
 
-use crate::{Contact, LocalModel};
+use crate::{LocalModel, ToolContact};
 
 /// Longest time that a proxy is extrapolated with its last velocity, and longest time that a
 /// correction takes, s.
@@ -36,11 +36,11 @@ impl ProxyExtrapolation {
         now: f64,
         dt: f64,
         model: &LocalModel,
-        contact: &Contact,
+        contact: &ToolContact,
     ) -> (Vector3<f64>, Vector3<f64>) {
         if self.tick != model.tick {
             let fresh = self.tick == 0;
-            let would = self.shown(now, dt);
+            let would = self.displayed(now, dt);
             let period = if model.period.is_finite() { model.period.clamp(0.0, LONGEST) } else { 0.0 };
             // A longer interval counts at once, and a shorter one gradually.
             let waited = if fresh { period } else { (now - self.since).clamp(0.0, LONGEST) };
@@ -55,7 +55,7 @@ impl ProxyExtrapolation {
         if self.left(now, dt) > 0.0 && self.interval > 2.0 * dt {
             velocity -= self.offset / self.interval;
         }
-        (self.shown(now, dt), velocity)
+        (self.displayed(now, dt), velocity)
     }
 
     fn age(&self, now: f64) -> f64 {
@@ -67,7 +67,7 @@ impl ProxyExtrapolation {
         if self.interval > 0.0 { (1.0 - (self.age(now) + dt) / self.interval).max(0.0) } else { 0.0 }
     }
 
-    fn shown(&self, now: f64, dt: f64) -> Vector3<f64> {
+    fn displayed(&self, now: f64, dt: f64) -> Vector3<f64> {
         self.received + self.speed * self.age(now).min(self.interval) + self.offset * self.left(now, dt)
     }
 }

@@ -103,7 +103,7 @@ impl Tool {
 
     /// Updates the tool from the hand's pose. With `hold` the tool stays where it is whatever the
     /// hand does (a jump of the measurement).
-    pub(crate) fn follow(
+    pub(crate) fn update(
         &mut self,
         position: Vector3<f64>,
         velocity: Vector3<f64>,
@@ -160,7 +160,7 @@ mod tests {
     use super::*;
 
     fn still(tool: &mut Tool, p: [f64; 3], buttons: u32) -> [f64; 3] {
-        tool.follow(p.into(), Vector3::zeros(), UnitQuaternion::identity(), buttons, false);
+        tool.update(p.into(), Vector3::zeros(), UnitQuaternion::identity(), buttons, false);
         tool.position.into()
     }
 

@@ -2,7 +2,7 @@
 
 #[cfg(feature = "vendor")]
 use crate::{ForceDimension, ForceDimensionConfig, OpenHaptics, OpenHapticsConfig};
-use crate::{Hand, HapticDevice, VirtualConfig, VirtualDevice};
+use crate::{HandModel, HapticDevice, VirtualConfig, VirtualDevice};
 #[cfg(feature = "inverse")]
 use crate::{Inverse, InverseConfig};
 
@@ -53,7 +53,7 @@ impl Found {
             Self::OpenHaptics(config) => Box::new(OpenHaptics::open(config.clone())?),
             #[cfg(feature = "vendor")]
             Self::ForceDimension(config) => Box::new(ForceDimension::open(config.clone())?),
-            Self::Virtual => Box::new(VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM)?),
+            Self::Virtual => Box::new(VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM)?),
         })
     }
 }

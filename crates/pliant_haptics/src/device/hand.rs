@@ -6,7 +6,7 @@
 /// The ranges of the literature are: mass 0.05 to 0.6 kg, damping 1 to 10 N s/m, stiffness 50 to
 /// 500 N/m. The presets include the hard cases, a loose grip and no hand at all.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hand {
+pub struct HandModel {
     /// Mass that moves with the handle, kg.
     pub mass: f64,
     /// Damping toward the target of the arm, N s/m.
@@ -15,7 +15,7 @@ pub struct Hand {
     pub stiffness: f64,
 }
 
-impl Hand {
+impl HandModel {
     /// A fist around the handle.
     pub const FIRM: Self = Self { mass: 0.3, damping: 10.0, stiffness: 500.0 };
     /// The grip of a pen.

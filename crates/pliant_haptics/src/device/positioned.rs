@@ -155,7 +155,7 @@ impl HapticDevice for Positioned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Contact, Cycle, LocalModel, LoopConfig, LoopEvent, VirtualScheduler};
+    use crate::{Cycle, LocalModel, LoopConfig, LoopEvent, ToolContact, VirtualScheduler};
 
     #[test]
     fn a_stop_waits_for_nobody() {
@@ -196,8 +196,10 @@ mod tests {
         let mut events: Vec<LoopEvent> = Vec::new();
         let k = 100.0;
         let mut model = LocalModel { period: 0.01, count: 1, ..LocalModel::default() };
-        model.contacts[0] =
-            Contact { stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() };
+        model.contacts[0] = ToolContact {
+            stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
+            ..ToolContact::default()
+        };
         let mut fastest = 0.0f64;
         let mut run = |cycle: &mut Cycle<Positioned>, events: &mut Vec<LoopEvent>, ticks: usize| {
             for _ in 0..ticks {

@@ -23,7 +23,7 @@ const RECORD: usize = NUMBERS * 8 + 4 + 8;
 const LONGEST_INFO: u32 = 64 * 1024;
 /// Default size limit of a recording, bytes: 1.9 hours at 1 kHz. The same limit holds for reading,
 /// because a replay keeps all records in memory.
-const MOST_BYTES: u64 = 1 << 30;
+const MAX_BYTES: u64 = 1 << 30;
 
 /// Reason why a recording cannot be read or written.
 #[derive(Debug, Error)]
@@ -69,14 +69,14 @@ impl<W: Write> Recorder<W> {
         out.write_all(&(info.len() as u32).to_le_bytes())?;
         out.write_all(&info)?;
         let written = (MAGIC.len() + 6 + info.len()) as u64;
-        Ok(Self { out, written, limit: MOST_BYTES })
+        Ok(Self { out, written, limit: MAX_BYTES })
     }
 
     /// Sets the size limit of the whole recording, bytes. A limit above 1 GiB counts as 1 GiB,
     /// because a longer recording could not be read. Default: 1 GiB.
     #[must_use]
     pub fn with_limit(self, bytes: u64) -> Self {
-        Self { limit: bytes.min(MOST_BYTES), ..self }
+        Self { limit: bytes.min(MAX_BYTES), ..self }
     }
 
     /// Writes the record of one period.
@@ -135,7 +135,7 @@ impl Replay {
     /// Returns an error if the data is not a recording, is damaged or is longer than 1 GiB, and
     /// errors of the stream.
     pub fn read(from: impl Read) -> Result<Self, RecordError> {
-        Self::read_at_most(from, MOST_BYTES)
+        Self::read_at_most(from, MAX_BYTES)
     }
 
     fn read_at_most(mut from: impl Read, limit: u64) -> Result<Self, RecordError> {
@@ -245,7 +245,8 @@ impl HapticDevice for Replay {
 mod tests {
     use super::*;
     use crate::{
-        Cycle, Hand, LocalModel, LoopConfig, LoopEvent, Sink, VirtualConfig, VirtualDevice, VirtualScheduler,
+        Cycle, HandModel, LocalModel, LoopConfig, LoopEvent, Sink, VirtualConfig, VirtualDevice,
+        VirtualScheduler,
     };
 
     fn replay_info(bytes: &[u8]) -> DeviceInfo {
@@ -270,7 +271,7 @@ mod tests {
 
     #[test]
     fn the_same_hand_twice() {
-        let device = VirtualDevice::new(VirtualConfig::touch(), Hand::LIGHT).unwrap();
+        let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::LIGHT).unwrap();
         let hand = device.handle();
         let mut recorder = Recorder::new(Vec::new(), &device.info()).unwrap();
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();

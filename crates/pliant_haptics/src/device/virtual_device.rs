@@ -8,7 +8,7 @@ use std::sync::{
 use nalgebra::Vector3;
 use pliant_modal::{Coefficients, Integrator};
 
-use crate::{DeviceInfo, Fault, Hand, HapticDevice, InfoError, Sample, Scheduler, Wrench};
+use crate::{DeviceInfo, Fault, HandModel, HapticDevice, InfoError, Sample, Scheduler, Wrench};
 
 /// Properties of a virtual device.
 #[derive(Debug, Clone, PartialEq)]
@@ -191,7 +191,7 @@ impl VirtualHandle {
 #[derive(Debug)]
 pub struct VirtualDevice {
     config: VirtualConfig,
-    hand: Hand,
+    hand: HandModel,
     handle: VirtualHandle,
     position: Vector3<f64>,
     velocity: Vector3<f64>,
@@ -203,7 +203,7 @@ pub struct VirtualDevice {
     force: Vector3<f64>,
     work: f64,
     sequence: u64,
-    shown: Vector3<f64>,
+    displayed: Vector3<f64>,
 }
 
 impl VirtualDevice {
@@ -211,7 +211,7 @@ impl VirtualDevice {
     ///
     /// # Errors
     /// Returns an error if a number of the device or the hand is out of range.
-    pub fn new(config: VirtualConfig, hand: Hand) -> Result<Self, InfoError> {
+    pub fn new(config: VirtualConfig, hand: HandModel) -> Result<Self, InfoError> {
         config.info().check()?;
         if !(config.integration_rate.is_finite() && config.integration_rate >= 20_000.0) {
             let (what, expected) = ("integration_rate", "20 kHz or more");
@@ -238,7 +238,7 @@ impl VirtualDevice {
             force: zero,
             work: 0.0,
             sequence: 0,
-            shown: zero,
+            displayed: zero,
         })
     }
 
@@ -280,7 +280,7 @@ impl VirtualDevice {
     }
 
     /// Changes the grip. An invalid grip is refused.
-    pub fn set_hand(&mut self, hand: Hand) {
+    pub fn set_hand(&mut self, hand: HandModel) {
         if hand.is_valid() {
             self.hand = hand;
             self.coefficients = None;
@@ -354,10 +354,10 @@ impl VirtualDevice {
     fn sample(&mut self) -> Sample {
         if !self.handle.shared.frozen.load(Ordering::Relaxed) {
             self.sequence += 1;
-            self.shown = self.measured();
+            self.displayed = self.measured();
         }
         Sample {
-            position: self.shown.into(),
+            position: self.displayed.into(),
             buttons: self.handle.shared.buttons.load(Ordering::Relaxed),
             sequence: Some(self.sequence),
             ..Sample::default()
@@ -399,7 +399,7 @@ mod tests {
         // Without damping, friction and a hand, the energy from the motors is the kinetic energy of
         // the handle.
         let mut device =
-            VirtualDevice::new(VirtualConfig { damping: 0.0, ..VirtualConfig::default() }, Hand::NONE)
+            VirtualDevice::new(VirtualConfig { damping: 0.0, ..VirtualConfig::default() }, HandModel::NONE)
                 .unwrap();
         for k in 0..2000 {
             let t = f64::from(k) * 1e-3;
@@ -411,7 +411,7 @@ mod tests {
 
     #[test]
     fn hand_settles_where_it_should() {
-        let mut device = VirtualDevice::new(VirtualConfig::default(), Hand::FIRM).unwrap();
+        let mut device = VirtualDevice::new(VirtualConfig::default(), HandModel::FIRM).unwrap();
         device.handle().set_target([0.01, 0.0, 0.0]);
         for _ in 0..2000 {
             device.advance([1.0, 0.0, 0.0], 1e-3);
@@ -420,7 +420,7 @@ mod tests {
         assert!((device.position()[0] - 0.012).abs() < 1e-9, "{:?}", device.position());
         // Friction holds against a force that is smaller.
         let config = VirtualConfig { friction: 0.3, ..VirtualConfig::default() };
-        let mut device = VirtualDevice::new(config, Hand::NONE).unwrap();
+        let mut device = VirtualDevice::new(config, HandModel::NONE).unwrap();
         for _ in 0..100 {
             device.advance([0.29, 0.0, 0.0], 1e-3);
         }
@@ -430,7 +430,7 @@ mod tests {
     #[test]
     fn encoder_rounds_and_nonsense_is_refused() {
         let config = VirtualConfig { resolution: 50e-6, ..VirtualConfig::default() };
-        let mut device = VirtualDevice::new(config.clone(), Hand::NONE).unwrap();
+        let mut device = VirtualDevice::new(config.clone(), HandModel::NONE).unwrap();
         device.place([1.13e-4, -0.6e-4, 0.0], [0.0; 3]);
         let p = device.sample().position;
         assert!((p[0] - 1e-4).abs() < 1e-12 && (p[1] + 5e-5).abs() < 1e-12, "{p:?}");
@@ -444,7 +444,7 @@ mod tests {
             VirtualConfig { integration_rate: 1000.0, ..config.clone() },
             VirtualConfig { delay_periods: 64, ..config },
         ] {
-            assert!(VirtualDevice::new(bad, Hand::NONE).is_err());
+            assert!(VirtualDevice::new(bad, HandModel::NONE).is_err());
         }
     }
 }

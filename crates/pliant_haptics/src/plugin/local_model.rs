@@ -171,7 +171,7 @@ pub(crate) fn publish(
             }
         } else if entry.elsewhere.is_alive(&held, &bodies, now) {
             entry.elsewhere.springs.retain(|(e, _)| entities.contains(e));
-            let felt: Vec<PublishedGrab> = held
+            let published: Vec<PublishedGrab> = held
                 .iter()
                 .filter_map(|(entity, of, grab, force, offset)| {
                     // The force is unknown: the session has not answered yet, or it is over.
@@ -194,7 +194,7 @@ pub(crate) fn publish(
             let stored = stored(&held, &bodies);
             let write = |model: &mut LocalModel| {
                 model.interval = interval;
-                writer.write_forces(&felt, relaxation, stored, period, seen, model);
+                writer.write_forces(&published, relaxation, stored, period, seen, model);
             };
             entry.running.get().publish(write);
         }

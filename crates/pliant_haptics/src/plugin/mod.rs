@@ -4,7 +4,7 @@
 //! ```no_run
 //! use bevy::prelude::*;
 //! use pliant_body::{ModalBody, PliantBodyPlugin};
-//! use pliant_haptics::{Hand, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, ToolGrip, VirtualDevice, VirtualConfig};
+//! use pliant_haptics::{HandModel, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, ToolGrip, VirtualDevice, VirtualConfig};
 //!
 //! fn main() {
 //!     App::new()
@@ -15,7 +15,7 @@
 //!
 //! fn setup(mut commands: Commands, assets: Res<AssetServer>, mut devices: ResMut<HapticDevices>) -> Result {
 //!     commands.spawn(ModalBody::new(assets.load("pip.modal")));
-//!     let device = devices.add(VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM)?, LoopConfig::default())?;
+//!     let device = devices.add(VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM)?, LoopConfig::default())?;
 //!     commands.spawn((HapticTool::new(device), ToolGrip::default(), Transform::from_xyz(0.0, 1.0, 0.0)));
 //!     Ok(())
 //! }
@@ -102,7 +102,7 @@ impl Plugin for HapticsPlugin {
                     devices::read,
                     tool::place,
                     tool::grip,
-                    tool::let_go,
+                    tool::release_removed,
                     source::press.in_set(PointerToolSystems::Press),
                     source::point.in_set(PointerToolSystems::Move),
                 )
@@ -110,7 +110,7 @@ impl Plugin for HapticsPlugin {
                     .after(InputSystems)
                     .after(PickingSystems::Backend),
             )
-            .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
+            .add_systems(self.schedule, tool::update_tools.in_set(HapticSystems::Move))
             .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::LocalModel));
         #[cfg(feature = "gamepad")]
         app.add_systems(PreUpdate, source::steer.after(tool::grip).after(InputSystems));

@@ -155,7 +155,7 @@ pub(crate) fn place(
 }
 
 /// Before a tick: moves the tools and the targets of their grabs to the hands.
-pub(crate) fn follow(
+pub(crate) fn update_tools(
     mut devices: ResMut<HapticDevices>,
     mut tools: Query<(&HapticTool, &mut ToolPose, Option<&ToolGrabs>)>,
     mut grabs: Query<(&mut Grab, Option<&ToolOffset>)>,
@@ -186,7 +186,7 @@ pub(crate) fn follow(
 }
 
 /// Releases the grabs of a tool whose device was removed, and resets its force.
-pub(crate) fn let_go(
+pub(crate) fn release_removed(
     mut commands: Commands,
     devices: Res<HapticDevices>,
     mut tools: Query<(&HapticTool, &mut ToolPose, Option<&ToolGrabs>)>,

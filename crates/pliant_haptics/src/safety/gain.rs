@@ -47,14 +47,14 @@ impl StaleConfig {
     /// Longest update interval for which the limits apply unscaled, s.
     const EVERY: f64 = 0.025;
     /// Largest factor by which the limits grow.
-    const MOST: f64 = 4.0;
+    const MAX: f64 = 4.0;
 
     /// Scales the time without an update, `silent` (s), for a simulation that publishes every
     /// `interval` s.
     pub(crate) fn counted(silent: f64, interval: f64) -> f64 {
         let slower = interval / Self::EVERY;
         // `clamp` does not fit here: an interval that is NaN must leave the time unchanged.
-        if slower > 1.0 { silent / slower.min(Self::MOST) } else { silent }
+        if slower > 1.0 { silent / slower.min(Self::MAX) } else { silent }
     }
 
     /// Returns the largest gain allowed: 1 up to `patience`, 0 from `limit` on, and linear in

@@ -357,8 +357,8 @@ impl Safety {
         let (gain, cut) = self.gain.tick(&self.config, w.dt, speed, silence, w.fault.or(fault), w.stop);
         fault = fault.or(cut);
         // A multiplication by zero could leave a negative zero.
-        let felt = |f: Vector3<f64>| if gain > 0.0 { f * gain } else { zero };
-        let faded = felt(force);
+        let scaled = |f: Vector3<f64>| if gain > 0.0 { f * gain } else { zero };
+        let faded = scaled(force);
         // A fault never lets the force rise. After a stall, for example, the hand may be far from
         // where the last force met it.
         let most = if w.fault.or(fault).is_some() { self.last.norm() } else { f64::INFINITY };
@@ -367,7 +367,7 @@ impl Safety {
         if let Some(thermal) = &self.config.thermal {
             self.thermal.heat(thermal, self.config.peak.unwrap_or(thermal.continuous), force.norm(), w.dt);
         }
-        self.last_weight = felt(w.weight) * kept;
+        self.last_weight = scaled(w.weight) * kept;
         self.last = force;
         Allowed { force, gain, fault, port: self.passivity.port() }
     }

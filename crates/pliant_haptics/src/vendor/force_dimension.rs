@@ -414,7 +414,7 @@ impl HapticDevice for ForceDimension {
             Calibration::Ready
         } else {
             Calibration::Needed(
-                "initialise the device with its maker's HapticInit, move the handle to all its end stops, or let it find them (`auto_init`)",
+                "initialize the device with its maker's HapticInit, move the handle to all its end stops, or let it find them (`auto_init`)",
             )
         }
     }

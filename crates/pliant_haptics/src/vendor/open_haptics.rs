@@ -82,7 +82,7 @@ const PRIORITY: c_ushort = u16::MAX / 2;
 const MAX_PRIORITY: c_ushort = u16::MAX;
 const CALLBACK_DONE: c_uint = 0;
 /// Most errors that are taken from the library's stack at once.
-const MOST_ERRORS: usize = 256;
+const MAX_ERRORS: usize = 256;
 /// Time that the servo thread has to run the supervisor's callback.
 const SERVO_PATIENCE: Duration = Duration::from_millis(10);
 
@@ -123,7 +123,7 @@ impl OpenHapticsApi {
     /// The library is loaded.
     unsafe fn drain(&self) -> ErrorInfo {
         let mut cause = ErrorInfo::default();
-        for _ in 0..MOST_ERRORS {
+        for _ in 0..MAX_ERRORS {
             // SAFETY: the function takes nothing and keeps nothing.
             let error = unsafe { (self.get_error)() };
             if error.code == 0 {

@@ -7,8 +7,8 @@ pub mod machine;
 pub mod scene;
 
 use pliant_haptics::{
-    Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, VirtualConfig,
-    VirtualDevice, VirtualScheduler,
+    CouplingConfig, Cycle, HandModel, LocalModel, LoopConfig, LoopEvent, SafetyConfig, ToolContact,
+    VirtualConfig, VirtualDevice, VirtualScheduler,
 };
 
 pub struct Rig {
@@ -19,7 +19,7 @@ pub struct Rig {
 }
 
 impl Rig {
-    pub fn new(device: VirtualConfig, hand: Hand, config: LoopConfig) -> Self {
+    pub fn new(device: VirtualConfig, hand: HandModel, config: LoopConfig) -> Self {
         let device = VirtualDevice::new(device, hand).unwrap();
         let rate = config.rate;
         Self {
@@ -31,14 +31,14 @@ impl Rig {
     }
 
     /// Creates a rig without any optional stage of the safety pipeline.
-    pub fn bare(device: VirtualConfig, hand: Hand) -> Self {
+    pub fn bare(device: VirtualConfig, hand: HandModel) -> Self {
         let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
         Self::new(device, hand, config)
     }
 
     /// Creates a rig whose safety settings are those for the device, modified by `change`. A test
     /// can leave out stages that it does not measure, such as the ramp.
-    pub fn with(device: VirtualConfig, hand: Hand, change: impl FnOnce(&mut SafetyConfig)) -> Self {
+    pub fn with(device: VirtualConfig, hand: HandModel, change: impl FnOnce(&mut SafetyConfig)) -> Self {
         let mut safety = SafetyConfig::for_device(&device.info(), 1000.0);
         change(&mut safety);
         let config =
@@ -58,10 +58,10 @@ impl Rig {
         self.model.period = 1e-3;
         self.model.count = 1;
         let k = stiffness;
-        self.model.contacts[0] = Contact {
+        self.model.contacts[0] = ToolContact {
             stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
             damping,
-            ..Contact::default()
+            ..ToolContact::default()
         };
         self.step();
     }

@@ -4,7 +4,7 @@
 use std::{collections::VecDeque, sync::Arc};
 
 use pliant_haptics::{
-    Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap,
+    Cycle, HandModel, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap,
     VirtualConfig, VirtualDevice, VirtualHandle, VirtualScheduler,
 };
 use pliant_modal::{Body, BodyConfig, ModalModel, Patch};
@@ -52,7 +52,7 @@ pub struct SceneConfig {
     pub young: f64,
     pub modes: usize,
     pub device: VirtualConfig,
-    pub hand: Hand,
+    pub hand: HandModel,
     pub rate: f64,
     pub simulation: f64,
     pub round_trip: f64,
@@ -66,7 +66,7 @@ impl Default for SceneConfig {
             young: 1e5,
             modes: 60,
             device: VirtualConfig::touch(),
-            hand: Hand::LIGHT,
+            hand: HandModel::LIGHT,
             rate: 1000.0,
             simulation: 120.0,
             round_trip: 0.0,
@@ -222,7 +222,7 @@ impl Drag {
 /// Drags 3 cm to the side in half a second and holds still. Without a hand, the free device gets an
 /// initial velocity instead.
 pub fn drag(config: SceneConfig) -> Drag {
-    let free = config.hand == Hand::NONE;
+    let free = config.hand == HandModel::NONE;
     let mut scene = Scene::new(config);
     scene.run(0.5);
     if free {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use pliant_modal::{Body, GrabConfig, GrabId, Patch};
 use pliant_stream::{
-    GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, Pose, TickState, UserId,
+    GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, RigidState, TickState, UserId,
 };
 
 use super::{BODY, Experiment, HandScript, Metrics, RECOVERED, ShapeError, fold, norm};
@@ -292,7 +292,7 @@ impl World for Run {
                 })
             })
             .collect();
-        let pose = self.body.model().is_free().then(|| Pose::of(&self.body));
+        let pose = self.body.model().is_free().then(|| RigidState::of(&self.body));
         let state = TickState {
             tick,
             q: self.body.q(),

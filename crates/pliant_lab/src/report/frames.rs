@@ -38,7 +38,7 @@ fn bytes_a_tick(kbit_s: f64) -> f64 {
 }
 
 /// The error from the size of the quantization steps alone, without any loss.
-pub(super) fn quantised(quick: bool, progress: &mut dyn Progress) -> Result<Figure, LabError> {
+pub(super) fn quantized(quick: bool, progress: &mut dyn Progress) -> Result<Figure, LabError> {
     let powers: &[i32] = if quick { &[4, 8, 14, 20] } else { &[4, 6, 8, 10, 12, 14, 16, 18, 20, 24] };
     let mut series = Vec::new();
     let mut words = "A quantum is the displacement of the surface by one step of a quantized number, as a share of the deformation of the body. From left to right it is 2^-4 to 2^-20 and finer (default 2^-14; streams of accelerations use a 64th of it). There is no loss, and there are 120 modes, two hands and 40 steps a second. A stream of reactions rounds only the slices that refresh it, so the quantum matters little there. A stream of accelerations rounds every number that it sends, in a closed loop, so the rounding errors do not add up. At the default:"
@@ -68,7 +68,7 @@ pub(super) fn quantised(quick: bool, progress: &mut dyn Progress) -> Result<Figu
     words.push('.');
     Ok(Figure {
         file: "e-frames".into(),
-        title: "Quantised frames: how coarse they may be".into(),
+        title: "Quantized frames: how coarse they may be".into(),
         x: "down, bytes a tick".into(),
         y: "shown error, rms, % of the largest displacement".into(),
         logarithmic: true,

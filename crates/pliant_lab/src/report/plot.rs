@@ -60,7 +60,7 @@ pub(super) struct Figure {
 const SIZE: (u32, u32) = (860, 520);
 
 fn color(index: usize) -> RGBColor {
-    const COLOURS: [RGBColor; 8] = [
+    const COLORS: [RGBColor; 8] = [
         RGBColor(27, 158, 119),
         RGBColor(217, 95, 2),
         RGBColor(117, 112, 179),
@@ -70,7 +70,7 @@ fn color(index: usize) -> RGBColor {
         RGBColor(31, 120, 180),
         RGBColor(90, 90, 90),
     ];
-    COLOURS[index % COLOURS.len()]
+    COLORS[index % COLORS.len()]
 }
 
 /// Writes the figure as CSV, SVG and PNG into a folder.

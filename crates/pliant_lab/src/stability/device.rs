@@ -4,8 +4,8 @@
 use std::{collections::VecDeque, sync::Arc};
 
 use pliant_haptics::{
-    Contact, Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModelWriter, SafetyConfig, ToolMap,
-    VirtualConfig, VirtualDevice, VirtualScheduler,
+    Cycle, HandModel, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModelWriter, SafetyConfig, ToolContact,
+    ToolMap, VirtualConfig, VirtualDevice, VirtualScheduler,
 };
 use pliant_modal::{Body, BodyConfig, GrabConfig};
 
@@ -26,7 +26,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         out.push(Case::new("device", name, move || sampled_spring(mass, damping)));
     }
     for young in [1e3, 1e5, 1e7, 1e11] {
-        for (grip, hand) in Hand::PRESETS {
+        for (grip, hand) in HandModel::PRESETS {
             for round_trip in [0.0, 0.196] {
                 let far = if round_trip > 0.0 { ", 196 ms away" } else { "" };
                 let name = format!("E {young:.0e} Pa, grip {grip}{far}, 120 Hz");
@@ -35,7 +35,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         }
     }
     for simulation in [40.0, 1000.0] {
-        for (grip, hand) in [("loose", Hand::LOOSE), ("none", Hand::NONE)] {
+        for (grip, hand) in [("loose", HandModel::LOOSE), ("none", HandModel::NONE)] {
             let name = format!("E 1e5 Pa, grip {grip}, {simulation} Hz");
             out.push(Case::new("device", name, move || drag(1e5, hand, simulation, 0.0)));
         }
@@ -45,7 +45,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 /// Returns whether a free device on a bare spring of `k` (N/m) comes to rest.
 fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
     let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
-    let mut cycle = Cycle::new(VirtualDevice::new(device.clone(), Hand::NONE)?, config)?;
+    let mut cycle = Cycle::new(VirtualDevice::new(device.clone(), HandModel::NONE)?, config)?;
     let mut scheduler = VirtualScheduler::new(RATE);
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut update = LocalModel::default();
@@ -57,10 +57,10 @@ fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
         update.stamp = scheduler.now();
         update.period = 1.0 / RATE;
         update.count = 1;
-        update.contacts[0] = Contact {
+        update.contacts[0] = ToolContact {
             stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
             damping: 0.0,
-            ..Contact::default()
+            ..ToolContact::default()
         };
         cycle.step(&mut scheduler, &update, &mut events);
         let x = cycle.device().position()[0];
@@ -109,7 +109,7 @@ struct DeviceScene {
 }
 
 impl DeviceScene {
-    fn new(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Self, LabError> {
+    fn new(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result<Self, LabError> {
         let bar = BarBody { young, length: 0.15, modes: 12, zeta: 0.05, ..BarBody::default() };
         let model = bar.bake()?;
         let patch = bar.tip(&model)?;
@@ -186,10 +186,10 @@ impl DeviceScene {
 
 /// Drags the tool 3 cm to the side within half a second and holds it there. Without a hand, the
 /// free device gets an initial velocity instead.
-fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<CaseOutcome, LabError> {
+fn drag(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result<CaseOutcome, LabError> {
     let mut scene = DeviceScene::new(young, hand, simulation, round_trip)?;
     scene.largest_speed(0.5)?;
-    if hand == Hand::NONE {
+    if hand == HandModel::NONE {
         let at = scene.cycle.device().position();
         scene.cycle.device_mut().place(at, [0.1, 0.05, 0.0]);
     } else {

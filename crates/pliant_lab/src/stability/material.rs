@@ -242,7 +242,7 @@ fn struck(bar: &BarBody, step: f64, integrator: Integrator) -> Result<CaseOutcom
     Ok(CaseOutcome::of(vec![no_growth(growth)]))
 }
 
-/// Moves nodes inside the bar towards the opposite face of a tetrahedron, so that only `1 - share`
+/// Moves nodes inside the bar toward the opposite face of a tetrahedron, so that only `1 - share`
 /// of the height is left.
 fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
     let [low, high] = mesh.bounds();

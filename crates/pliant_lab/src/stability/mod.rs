@@ -28,7 +28,7 @@ use serde::Serialize;
 use crate::{LabError, progress::Progress};
 
 /// Largest number of threads that run cases.
-const MOST_THREADS: usize = 64;
+const MAX_THREADS: usize = 64;
 
 /// Settings of a run.
 #[derive(Debug, Clone, Default)]
@@ -59,11 +59,11 @@ impl Bound {
 
     /// Returns `limit / measured`, or 0 for a number that is not finite.
     pub fn margin(&self) -> f64 {
-        const MOST: f64 = 1e12;
+        const MAX: f64 = 1e12;
         if !self.measured.is_finite() {
             0.0
-        } else if self.measured * MOST <= self.limit {
-            MOST
+        } else if self.measured * MAX <= self.limit {
+            MAX
         } else {
             self.limit / self.measured
         }
@@ -233,9 +233,9 @@ pub fn run(settings: &StabilitySettings, progress: &mut dyn Progress) -> Result<
         .collect();
     let threads = settings.threads.unwrap_or(0);
     let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(threads.min(MOST_THREADS))
+        .num_threads(threads.min(MAX_THREADS))
         .build()
-        .map_err(|_| LabError::Threads { got: threads, most: MOST_THREADS })?;
+        .map_err(|_| LabError::Threads { got: threads, most: MAX_THREADS })?;
     let progress = Mutex::new((progress, 0usize));
     let cases: Vec<Verdict> = pool.install(|| {
         chosen

@@ -15,7 +15,7 @@ use crate::LabError;
 type Jerk = ([f64; 3], [f64; 3]);
 
 /// Most steps of a case. A step takes longer than one of linear elasticity.
-const MOST_STEPS: usize = 5_000;
+const MAX_STEPS: usize = 5_000;
 
 const END: [f64; 3] = [1.0, 0.5, 0.5];
 
@@ -105,7 +105,7 @@ fn jerked(
         body.set_target(grab, std::array::from_fn(|k| from[k] + way[k] * bar.length))?;
         grabs.push(grab);
     }
-    let steps = settling(&model, step).min(MOST_STEPS);
+    let steps = settling(&model, step).min(MAX_STEPS);
     let mut forces = Vec::with_capacity(steps);
     for _ in 0..steps {
         body.step()?;
@@ -136,7 +136,7 @@ fn started(shape: [f64; 3], step: f64) -> Result<CaseOutcome, LabError> {
     body.set_state(&state(&body, q, v))?;
     let start = body.energy();
     let mut most = 0.0f64;
-    for _ in 0..settling(&model, step).min(4 * MOST_STEPS) {
+    for _ in 0..settling(&model, step).min(4 * MAX_STEPS) {
         body.step()?;
         most = most.max(body.energy() / start);
     }

@@ -8,8 +8,8 @@ use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::{
-    BodyId, GrabKey, GrabState, GuestEvent, GuestSession, HostEvent, HostSession, HostSessionConfig, Pose,
-    StepSettings, TickState,
+    BodyId, GrabKey, GrabState, GuestEvent, GuestSession, HostEvent, HostSession, HostSessionConfig,
+    RigidState, StepSettings, TickState,
 };
 
 pub const BODY: BodyId = BodyId(3);
@@ -34,7 +34,7 @@ pub struct Scene {
     pub worst: f64,
     pub settled: Duration,
     /// The rigid pose at each tick, if the body is free.
-    pub poses: Vec<(u64, Pose)>,
+    pub poses: Vec<(u64, RigidState)>,
     /// The reaction of each hand at each tick, N.
     pub reactions: Vec<(u64, GrabKey, [f64; 3])>,
 }
@@ -96,7 +96,7 @@ impl World for Scene {
             })
             .collect();
         self.reactions.extend(grabs.iter().map(|g| (tick, g.key, g.reaction)));
-        let pose = self.body.model().is_free().then(|| Pose::of(&self.body));
+        let pose = self.body.model().is_free().then(|| RigidState::of(&self.body));
         self.poses.extend(pose.map(|pose| (tick, pose)));
         self.truth.push((tick, self.body.q().to_vec()));
         let (q, v, a) = (self.body.q(), self.body.v(), self.body.a());

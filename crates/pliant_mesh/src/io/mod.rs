@@ -289,11 +289,11 @@ pub fn write_whole(
 /// Creates a temporary file beside `goal` that did not exist before.
 fn new_part(goal: &Path, name: &std::ffi::OsStr) -> std::io::Result<(fs::File, std::path::PathBuf)> {
     /// Most names that are tried, because files of killed writers may have them.
-    const MOST: usize = 1000;
+    const MAX: usize = 1000;
     // Two threads that write the same file use different temporary files, and the last rename wins.
     static WRITES: AtomicU64 = AtomicU64::new(0);
     let mut last = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
-    for _ in 0..MOST {
+    for _ in 0..MAX {
         let number = WRITES.fetch_add(1, Ordering::Relaxed);
         let mut part = name.to_owned();
         part.push(format!(".{}.{number}.part", std::process::id()));

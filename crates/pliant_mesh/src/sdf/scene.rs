@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn the_field_changes_by_at_most_a_metre_a_metre() {
+    fn the_field_changes_by_at_most_a_meter_a_meter() {
         let pip = Scene::from_ron(PIP).unwrap();
         let x = |n: u32, a: f64| (f64::from(n) * a).fract();
         for n in 1..4000 {

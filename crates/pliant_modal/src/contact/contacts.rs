@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
-use super::{Bent, Cloud, ContactSites, Memory, Obstacle, Touching};
+use super::{Bent, Cloud, ContactSites, Memory, ObstacleShape, Touching};
 use crate::{Hand, StepError};
 
 /// What a body touches.
@@ -69,7 +69,7 @@ pub struct Contacts {
     /// Name of the body among those that are stepped with it.
     pub(crate) key: u64,
     friction: f64,
-    obstacles: Vec<Arc<dyn Obstacle>>,
+    obstacles: Vec<Arc<dyn ObstacleShape>>,
     pub(crate) places: Option<Arc<ContactSites>>,
     /// Modes of the body for which the sites were made.
     pub(crate) modes: usize,
@@ -111,7 +111,7 @@ impl Contacts {
     pub const FRICTION: f64 = 0.5;
 
     /// Largest coefficient of friction.
-    pub const MOST_FRICTION: f64 = 10.0;
+    pub const MAX_FRICTION: f64 = 10.0;
 
     /// The coefficient of Coulomb friction between the body and all obstacles, for sticking and
     /// sliding. Default: [`Contacts::FRICTION`].
@@ -119,19 +119,19 @@ impl Contacts {
         self.friction
     }
 
-    /// Sets the coefficient of friction, 0 to [`Contacts::MOST_FRICTION`].
+    /// Sets the coefficient of friction, 0 to [`Contacts::MAX_FRICTION`].
     ///
     /// # Errors
     /// Returns [`StepError::Input`] for another number. The old one then stays.
     pub fn set_friction(&mut self, friction: f64) -> Result<(), StepError> {
-        let sound = (0.0..=Self::MOST_FRICTION).contains(&friction);
+        let sound = (0.0..=Self::MAX_FRICTION).contains(&friction);
         StepError::check("friction", "0 to 10", sound, friction)?;
         self.friction = friction;
         Ok(())
     }
 
     /// The obstacles that the body may touch.
-    pub fn obstacles(&self) -> &[Arc<dyn Obstacle>] {
+    pub fn obstacles(&self) -> &[Arc<dyn ObstacleShape>] {
         &self.obstacles
     }
 
@@ -139,8 +139,8 @@ impl Contacts {
     /// the same index of the new list.
     ///
     /// # Errors
-    /// Returns the error of [`Obstacle::check`]. The old obstacles then stay.
-    pub fn set_obstacles(&mut self, obstacles: Vec<Arc<dyn Obstacle>>) -> Result<(), StepError> {
+    /// Returns the error of [`ObstacleShape::check`]. The old obstacles then stay.
+    pub fn set_obstacles(&mut self, obstacles: Vec<Arc<dyn ObstacleShape>>) -> Result<(), StepError> {
         obstacles.iter().try_for_each(|obstacle| obstacle.check())?;
         let left = |memory: &Memory| match memory.other {
             Touched::Obstacle(index) => index < obstacles.len(),
@@ -179,13 +179,13 @@ impl Contacts {
     /// Keeps what the hands have before a step.
     pub(crate) fn save(&mut self, hands: &[Hand]) {
         self.hands.clear();
-        self.hands.extend(hands.iter().map(|hand| [hand.pull, hand.mean, hand.flow]));
+        self.hands.extend(hands.iter().map(|hand| [hand.pull, hand.mean, hand.viscoelastic]));
     }
 
     /// Gives hands what they had before the step.
     pub(crate) fn restore(&self, hands: &mut [Hand]) {
-        for (hand, [pull, mean, flow]) in hands.iter_mut().zip(&self.hands) {
-            (hand.pull, hand.mean, hand.flow) = (*pull, *mean, *flow);
+        for (hand, [pull, mean, viscoelastic]) in hands.iter_mut().zip(&self.hands) {
+            (hand.pull, hand.mean, hand.viscoelastic) = (*pull, *mean, *viscoelastic);
         }
     }
 

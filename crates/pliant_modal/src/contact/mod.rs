@@ -30,7 +30,7 @@ mod solver;
 mod surface_field;
 
 pub use contacts::{Contact, ContactReport, Contacts, Touched};
-pub use obstacle::{Capsule, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint};
+pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint};
 
 pub(crate) use point::{Far, Memory, Point};
 pub(crate) use shape::{Guess, Near, Shape, Sixes};

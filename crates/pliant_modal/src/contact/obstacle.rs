@@ -17,7 +17,7 @@ pub struct SurfacePoint {
 /// A rigid shape that bodies touch.
 ///
 /// The distance must be exact or smaller than the exact distance, both inside and outside.
-pub trait Obstacle: std::fmt::Debug + Send + Sync {
+pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
     /// Signed distance and normal at a point (m, world axes).
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint;
 
@@ -46,7 +46,7 @@ fn direction(v: Vector3<f64>, otherwise: Vector3<f64>) -> (f64, Vector3<f64>) {
 }
 
 fn not_negative(what: &'static str, length: f64) -> Result<(), StepError> {
-    StepError::check(what, "finite metres, 0 or more", length.is_finite() && length >= 0.0, length)
+    StepError::check(what, "finite meters, 0 or more", length.is_finite() && length >= 0.0, length)
 }
 
 /// A half-space: everything below a plane.
@@ -63,7 +63,7 @@ impl Plane {
     pub const GROUND: Self = Self { point: [0.0; 3], normal: [0.0, 1.0, 0.0] };
 }
 
-impl Obstacle for Plane {
+impl ObstacleShape for Plane {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
         let (_, normal) = direction(Vector3::from(self.normal), Vector3::y());
         SurfacePoint { distance: normal.dot(&(point - Vector3::from(self.point))), normal }
@@ -87,7 +87,7 @@ pub struct Sphere {
     pub radius: f64,
 }
 
-impl Obstacle for Sphere {
+impl ObstacleShape for Sphere {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
         let (length, normal) = direction(point - Vector3::from(self.center), Vector3::y());
         SurfacePoint { distance: length - self.radius, normal }
@@ -108,7 +108,7 @@ pub struct Capsule {
     pub radius: f64,
 }
 
-impl Obstacle for Capsule {
+impl ObstacleShape for Capsule {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
         let [a, b] = self.ends.map(Vector3::from);
         let along = b - a;
@@ -147,7 +147,7 @@ impl Cuboid {
     }
 }
 
-impl Obstacle for Cuboid {
+impl ObstacleShape for Cuboid {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
         let turn = self.turn();
         let local = turn.inverse() * (point - Vector3::from(self.center));
@@ -192,7 +192,7 @@ pub struct Moving<O> {
     pub angular_velocity: [f64; 3],
 }
 
-impl<O: Obstacle> Obstacle for Moving<O> {
+impl<O: ObstacleShape> ObstacleShape for Moving<O> {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
         let [x, y, z, w] = self.rotation;
         let turn = UnitQuaternion::try_new(nalgebra::Quaternion::new(w, x, y, z), 1e-9).unwrap_or_default();
@@ -237,7 +237,7 @@ mod tests {
             velocity,
             angular_velocity,
         };
-        let all: [&dyn Obstacle; 5] = [&cuboid, &plane, &capsule, &sphere, &moving];
+        let all: [&dyn ObstacleShape; 5] = [&cuboid, &plane, &capsule, &sphere, &moving];
         for obstacle in all {
             obstacle.check().unwrap();
             for i in 1..200 {
@@ -259,7 +259,7 @@ mod tests {
     #[test]
     fn numbers_that_are_none_are_refused() {
         let nan = f64::NAN;
-        let bad: [&dyn Obstacle; 5] = [
+        let bad: [&dyn ObstacleShape; 5] = [
             &Plane { point: [nan, 0.0, 0.0], normal: [0.0, 1.0, 0.0] },
             &Plane { point: [0.0; 3], normal: [0.0; 3] },
             &Sphere { center: [0.0; 3], radius: nan },

@@ -11,7 +11,7 @@ use crate::{
 };
 
 /// Largest number of contact sites of a body.
-const MOST_SITES: usize = 384;
+const MAX_SITES: usize = 384;
 
 /// Largest radius of a round site, as a multiple of the body's size. Flatter sites count as flat.
 const FLAT: f64 = 4.0;
@@ -120,7 +120,7 @@ impl ContactSites {
         };
         let mut nearest: Vec<f64> = positions.iter().map(|p| (p - com).norm_squared()).collect();
         let mut chosen = Vec::new();
-        while chosen.len() <= MOST_SITES {
+        while chosen.len() <= MAX_SITES {
             let Some((vertex, distance)) = farthest(&nearest) else { break };
             if distance <= 0.0 && !chosen.is_empty() {
                 break;
@@ -128,7 +128,7 @@ impl ContactSites {
             if chosen.is_empty() {
                 nearest.fill(f64::INFINITY);
             }
-            if chosen.len() == MOST_SITES {
+            if chosen.len() == MAX_SITES {
                 break;
             }
             chosen.push(vertex);

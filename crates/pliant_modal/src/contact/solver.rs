@@ -86,8 +86,8 @@ impl Touching {
     const SWEEPS: usize = 3;
 
     /// Largest number of coordinates, and of multiplications, of a direct solve.
-    const MOST_WIDTH: usize = 512;
-    const MOST_WORK: usize = 4_000_000;
+    const MAX_WIDTH: usize = 512;
+    const MAX_WORK: usize = 4_000_000;
 
     /// Largest violation of the laws at the end of the last computed step, m.
     pub(crate) fn violation(&self) -> f64 {
@@ -266,7 +266,7 @@ impl Touching {
             span.reach = reach;
             work += span.width * (reach - span.start).pow(2);
         }
-        self.width() <= Self::MOST_WIDTH && work <= Self::MOST_WORK
+        self.width() <= Self::MAX_WIDTH && work <= Self::MAX_WORK
     }
 
     /// Recomputes the sum of the rows times the changes of the forces.

@@ -9,7 +9,7 @@ use crate::ModalModel;
 const CARRIERS: usize = 4;
 
 /// Largest number of sites that carry one place of the surface.
-pub(crate) const MOST_CARRIERS: usize = 3 * CARRIERS;
+pub(crate) const MAX_CARRIERS: usize = 3 * CARRIERS;
 
 /// Cosine of the angle between two triangles above which the surface is smooth between them.
 const SMOOTH: f64 = 0.7;
@@ -114,7 +114,7 @@ impl Place {
 /// Sites that carry a place, with their weights.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Carriers {
-    list: [(u32, f64); MOST_CARRIERS],
+    list: [(u32, f64); MAX_CARRIERS],
     count: usize,
 }
 
@@ -490,7 +490,7 @@ impl SurfaceField {
 
     /// The sites that carry a place.
     pub(crate) fn carriers(&self, place: &Place) -> Carriers {
-        let mut all = Carriers { list: [(0, 0.0); MOST_CARRIERS], count: 0 };
+        let mut all = Carriers { list: [(0, 0.0); MAX_CARRIERS], count: 0 };
         for (corner, weight) in place.weights.iter().enumerate() {
             if *weight != 0.0 {
                 for &(site, share) in self.corner_carriers(place, corner) {

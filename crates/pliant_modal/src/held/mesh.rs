@@ -37,7 +37,7 @@ impl SimulationMesh {
     pub const STEPS: f32 = 32_767.0;
 
     /// Maximum number of tetrahedra of a simulation mesh in a model.
-    pub const MOST_TETS: usize = 32_768;
+    pub const MAX_TETS: usize = 32_768;
 
     /// Returns the scales and the displacements for values `[node][axis][coordinate]`, kg^-1/2.
     pub fn quantized(values: &[f64], coordinates: usize) -> (Vec<f32>, Vec<i16>) {
@@ -66,7 +66,7 @@ impl SimulationMesh {
         if tets == 0 {
             return Err(ModelError::Empty("tetrahedron"));
         }
-        length("tetrahedra", tets.min(Self::MOST_TETS), tets)?;
+        length("tetrahedra", tets.min(Self::MAX_TETS), tets)?;
         length("node scales", modes, self.scales.len())?;
         length("vertex places", vertices, self.vertices.len())?;
         let count = self.corners.len();
@@ -82,7 +82,7 @@ impl SimulationMesh {
             Some((index, got)) => Err(ModelError::Value { what, index, expected, got: f64::from(got) }),
         };
         let finite = |x: &(usize, f32)| !x.1.is_finite();
-        value("corners", "finite metres", self.corners.iter().flatten().copied().enumerate().find(finite))?;
+        value("corners", "finite meters", self.corners.iter().flatten().copied().enumerate().find(finite))?;
         let positive = |x: &(usize, f32)| !(x.1.is_finite() && x.1 > 0.0);
         value("node scales", "above 0", self.scales.iter().copied().enumerate().find(positive))?;
         for (index, place) in self.vertices.iter().enumerate() {

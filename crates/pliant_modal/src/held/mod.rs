@@ -100,7 +100,7 @@ pub struct HeldShapes {
 impl HeldShapes {
     /// Largest number of patches whose shapes a body has at a time. Shapes of more hands would make
     /// a step too long.
-    pub const MOST_PATCHES: usize = 4;
+    pub const MAX_PATCHES: usize = 4;
 
     /// Makes the shapes of patches of a model. The result is the same on every machine.
     ///
@@ -119,7 +119,7 @@ impl HeldShapes {
         }
         let Some(reduced) = model.parts().reduced.as_ref() else { return Ok(None) };
         let Some(mesh) = &reduced.mesh else { return Ok(None) };
-        if patches.is_empty() || patches.len() > Self::MOST_PATCHES {
+        if patches.is_empty() || patches.len() > Self::MAX_PATCHES {
             return Ok(None);
         }
         let positions = model.surface().positions();
@@ -416,7 +416,7 @@ fn rule(
         for direction in
             [Vector3::x(), -Vector3::x(), Vector3::y(), -Vector3::y(), Vector3::z(), -Vector3::z()]
         {
-            shapes.extend(cubature::led(&mut energy, &omega, patch, &direction, &ways, most));
+            shapes.extend(cubature::guided_shapes(&mut energy, &omega, patch, &direction, &ways, most));
         }
     }
     let whole = || reference.iter().chain(&inside);

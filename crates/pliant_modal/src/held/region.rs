@@ -17,14 +17,14 @@ const REACH: f64 = 2.0;
 const LEAST: f64 = 0.3;
 
 /// Maximum number of elements around one patch.
-const MOST_ELEMENTS: usize = 2_000;
+const MAX_ELEMENTS: usize = 2_000;
 
 /// Residual of the static shapes, in the norm of the energy, at which the iteration ends. The
 /// shapes are a basis, so that they need not be exact.
 const TOLERANCE: f64 = 1e-3;
 
 /// Maximum number of iterations for the static shapes.
-const MOST_ITERATIONS: usize = 100;
+const MAX_ITERATIONS: usize = 100;
 
 /// Elements of the simulation mesh around some patches.
 pub(super) struct Region<'a> {
@@ -71,7 +71,7 @@ impl<'a> Region<'a> {
                     .filter(|(away, _)| *away <= reach)
                     .collect();
                 near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-                near.truncate(MOST_ELEMENTS);
+                near.truncate(MAX_ELEMENTS);
                 let mut near: Vec<u32> = near.into_iter().map(|(_, e)| e).collect();
                 near.sort_unstable();
                 near
@@ -476,7 +476,7 @@ impl Stiffness {
         let mut left = dots(&residual, &z);
         let enough: Vec<f64> = left.iter().map(|x| TOLERANCE * TOLERANCE * x).collect();
         f.fill(0.0);
-        for _ in 0..MOST_ITERATIONS {
+        for _ in 0..MAX_ITERATIONS {
             self.times(&direction, width, &mut forces);
             // Nodes that are not free have no direction, and their forces count for nothing.
             let step = ratio(&left, &dots(&direction, &forces));

@@ -30,10 +30,10 @@ impl Default for GrabConfig {
 impl GrabConfig {
     /// Largest stiffness accepted from a network, N/m. It is twenty times that of the stiffest
     /// devices (5,000 N/m), for tools that scale forces up.
-    pub const MOST_STIFFNESS: f64 = 1e5;
+    pub const MAX_STIFFNESS: f64 = 1e5;
     /// Longest relaxation time of a damper accepted from a network, s. The strongest dampers of
     /// devices (30 N s/m) on the softest hands (50 N/m) have 0.6 s.
-    pub const MOST_RELAXATION: f64 = 1.0;
+    pub const MAX_RELAXATION: f64 = 1.0;
 
     /// Returns the configuration limited to the range of real devices and rounded to single
     /// precision, for transmission over a network.
@@ -42,8 +42,8 @@ impl GrabConfig {
         let cap = |x: f64, most: f64| f64::from(x.min(most) as f32);
         Self {
             // A spring that is too soft for single precision must remain a spring.
-            stiffness: self.stiffness.map(|k| cap(k, Self::MOST_STIFFNESS).max(f64::from(f32::MIN_POSITIVE))),
-            relaxation: cap(self.relaxation, Self::MOST_RELAXATION),
+            stiffness: self.stiffness.map(|k| cap(k, Self::MAX_STIFFNESS).max(f64::from(f32::MIN_POSITIVE))),
+            relaxation: cap(self.relaxation, Self::MAX_RELAXATION),
         }
     }
 
@@ -73,7 +73,7 @@ pub struct Hand {
     pub mean: Vector3<f64>,
     /// Viscoelastic state of the patch's residual flexibility, m, body axes: the `z` of the
     /// compliance that the modes leave out. Zero where the material is elastic.
-    pub flow: Vector3<f64>,
+    pub viscoelastic: Vector3<f64>,
 }
 
 /// What holds a patch.
@@ -99,7 +99,7 @@ impl Hand {
     /// Makes a hand without any force so far.
     pub fn new(patch: Arc<HeldPatch>, hold: Hold) -> Self {
         let zero = Vector3::zeros();
-        Self { patch, hold, pull: zero, mean: zero, flow: zero }
+        Self { patch, hold, pull: zero, mean: zero, viscoelastic: zero }
     }
 
     /// Spring and damper of the hand. A measured patch returns the default, which has no effect.
@@ -153,13 +153,13 @@ impl ViscoelasticPatch {
     }
 
     /// Displacement of a patch in a step that is due to earlier forces alone, m.
-    pub(crate) fn crept(&self, flow: &Vector3<f64>) -> Vector3<f64> {
-        self.ratio * self.carry * flow
+    pub(crate) fn creep_displacement(&self, viscoelastic: &Vector3<f64>) -> Vector3<f64> {
+        self.ratio * self.carry * viscoelastic
     }
 
     /// Returns the viscoelastic state after a step under a force `pull` (N, body axes).
     pub(crate) fn step(&self, hand: &Hand, pull: &Vector3<f64>) -> Vector3<f64> {
-        self.carry * hand.flow + self.gain * (self.softness * (hand.patch.residual() * pull))
+        self.carry * hand.viscoelastic + self.gain * (self.softness * (hand.patch.residual() * pull))
     }
 }
 
@@ -170,12 +170,9 @@ mod tests {
     #[test]
     fn a_hand_from_a_network_is_no_stiffer_and_no_slower_than_a_device() {
         let hand = |stiffness, relaxation| GrabConfig { stiffness, relaxation }.capped();
-        assert_eq!(
-            hand(Some(1e9), 50.0),
-            hand(Some(GrabConfig::MOST_STIFFNESS), GrabConfig::MOST_RELAXATION)
-        );
-        assert_eq!(hand(Some(1e9), 50.0).stiffness, Some(GrabConfig::MOST_STIFFNESS));
-        assert_eq!(hand(Some(1e9), 50.0).relaxation, GrabConfig::MOST_RELAXATION);
+        assert_eq!(hand(Some(1e9), 50.0), hand(Some(GrabConfig::MAX_STIFFNESS), GrabConfig::MAX_RELAXATION));
+        assert_eq!(hand(Some(1e9), 50.0).stiffness, Some(GrabConfig::MAX_STIFFNESS));
+        assert_eq!(hand(Some(1e9), 50.0).relaxation, GrabConfig::MAX_RELAXATION);
         // What real devices have stays, but for the rounding to single precision.
         let real = hand(Some(2_000.0), 0.015);
         assert!(real.stiffness == Some(2_000.0) && (real.relaxation - 0.015).abs() < 1e-8, "{real:?}");

@@ -168,7 +168,7 @@ impl ElasticStep {
 
     /// Brings the columns to rest under the hands' forces (N, body axes), while the coordinates
     /// stay where they are.
-    pub(crate) fn settle<'a>(
+    pub(crate) fn equilibrate_columns<'a>(
         &mut self,
         state: &mut State,
         pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>,

@@ -49,9 +49,9 @@ impl ImpliedPulls {
         let ratio = settings.relaxation.map_or(0.0, |relaxation| relaxation.ratio);
         kernel.elastic_force(state, &mut self.force);
         for (k, force) in self.force.iter_mut().enumerate() {
-            let flow = ratio * state.z.get(k).copied().unwrap_or(0.0);
+            let viscoelastic = ratio * state.z.get(k).copied().unwrap_or(0.0);
             let (omega, damping) = (kernel.omega()[k], kernel.damping()[k]);
-            *force += state.a[k] + damping * state.v[k] - omega * omega * flow;
+            *force += state.a[k] + damping * state.v[k] - omega * omega * viscoelastic;
         }
         kernel.weight(&state.frame, &state.q, &mut self.weight);
         for (force, weight) in self.force.iter_mut().zip(&self.weight) {

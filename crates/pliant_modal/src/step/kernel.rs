@@ -70,7 +70,7 @@ struct Solving {
     /// step is `(1 + x) F - x F_before`.
     beyond: f64,
     /// Displacement of the patch in this step that is due to earlier forces alone, m, body axes.
-    crept: Vector3<f64>,
+    creep_displacement: Vector3<f64>,
     /// Position of the patch relative to the center of mass, m, body axes.
     arm: Vector3<f64>,
     /// Force on the body over the step, N, body axes.
@@ -249,7 +249,7 @@ impl Kernel {
         }
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
-        self.settle(state, hands);
+        self.equilibrate_columns(state, hands);
         Ok(())
     }
 
@@ -257,11 +257,11 @@ impl Kernel {
     /// coordinates stay. Without shapes of held patches nothing changes.
     ///
     /// This finds the columns of a state that came from elsewhere, such as a network.
-    pub fn settle(&mut self, state: &mut State, hands: &[Hand]) {
+    pub fn equilibrate_columns(&mut self, state: &mut State, hands: &[Hand]) {
         let back = state.frame.rotation().inverse();
         let pulls = hands.iter().map(|hand| (&*hand.patch, back * hand.mean));
         if let Some(elastic) = self.elastic.as_mut().filter(|elastic| elastic.shapes().is_some()) {
-            elastic.settle(state, pulls);
+            elastic.equilibrate_columns(state, pulls);
         }
     }
 
@@ -378,7 +378,7 @@ impl Kernel {
 
     /// Returns the viscoelastic state of a hand's patch after one step under a force `pull`
     /// (N, body axes).
-    pub fn flow(&self, hand: &Hand, pull: Vector3<f64>) -> Vector3<f64> {
+    pub fn viscoelastic_after(&self, hand: &Hand, pull: Vector3<f64>) -> Vector3<f64> {
         self.creep.step(hand, &pull)
     }
 
@@ -445,7 +445,9 @@ impl Kernel {
         self.check_step(state, hands)?;
         self.before.clone_from(state);
         let report = self.advance(state, hands, load);
-        let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
+        let bad = |hand: &Hand| {
+            !hand.pull.iter().chain(&hand.mean).chain(&hand.viscoelastic).all(|x| x.is_finite())
+        };
         let what = state.non_finite().or(hands.iter().any(bad).then_some("a reaction"));
         let Some(what) = what else { return Ok(report) };
         self.give_up(state, hands);
@@ -497,7 +499,7 @@ impl Kernel {
         for hand in hands {
             hand.pull = Vector3::zeros();
             hand.mean = Vector3::zeros();
-            hand.flow = Vector3::zeros();
+            hand.viscoelastic = Vector3::zeros();
         }
     }
 
@@ -546,7 +548,7 @@ impl Kernel {
     fn bend_under_gravity(&mut self, state: &mut State) {
         /// Maximum number of rounds. The force changes the end of the step, which changes the
         /// force.
-        const MOST_ROUNDS: usize = 12;
+        const MAX_ROUNDS: usize = 12;
         /// Tolerance of the bend force, as a share of the largest force.
         const SHARE: f64 = 1e-6;
         let local = state.frame.rotation().inverse() * Vector3::from(self.settings.gravity);
@@ -559,7 +561,7 @@ impl Kernel {
         self.bend.copy_from_slice(&self.start);
         self.pulls.copy_from_slice(&self.start);
         self.modes.respond(&self.pulls, state);
-        for round in 0..MOST_ROUNDS {
+        for round in 0..MAX_ROUNDS {
             self.pulls.copy_from_slice(&self.start);
             let work = sites.add(&local, &state.q, &mut self.pulls) - before;
             self.pulls.iter_mut().for_each(|force| *force *= 0.5);
@@ -642,7 +644,7 @@ impl Kernel {
     fn hold(&mut self, state: &mut State, hands: &mut [Hand], mut rigid: Option<RigidMotion>) -> StepReport {
         self.prepare(hands);
         self.begin(state, hands);
-        let most = StepSettings::MOST_CORRECTIONS;
+        let most = StepSettings::MAX_CORRECTIONS;
         let (warp, curved) = (self.warps(), self.warps() || self.elastic.is_some());
         let rounds = if curved { self.settings.corrections.clamp(1, most) } else { 1 };
         let mut report = StepReport::default();
@@ -725,7 +727,7 @@ impl Kernel {
             rigid.apply(&mut state.frame, &self.model, force, torque + place.slack(rigid));
         }
         for (hand, solving) in hands.iter_mut().zip(&self.solving) {
-            hand.flow = self.creep.step(hand, &solving.pull);
+            hand.viscoelastic = self.creep.step(hand, &solving.pull);
             // The solve uses body axes, and hands use world axes.
             let mean = place.turn * solving.pull;
             hand.pull = mean + solving.beyond * (mean - hand.mean);
@@ -760,7 +762,7 @@ impl Kernel {
                 solving.target = target;
                 // Targets may teleport, and their velocity is then meaningless.
                 solving.lead = (config.relaxation * velocity).cap_magnitude(2.0 * self.model.size());
-                solving.crept = self.creep.crept(&hand.flow);
+                solving.creep_displacement = self.creep.creep_displacement(&hand.viscoelastic);
                 solving.relaxation = config.relaxation;
                 if config.relaxation > 0.0 {
                     solving.speed = hand.patch.rows().reduce(&self.velocity, warp);
@@ -820,7 +822,7 @@ impl Kernel {
                     let ahead = hand.patch.rest() + along;
                     let mut gap = solving.target
                         - place.unheld_position(&self.model, rigid, ahead)
-                        - place.turn * solving.crept;
+                        - place.turn * solving.creep_displacement;
                     // Targets may teleport. No hand pulls harder than from one length of the body
                     // away, in the direction of its target. Such a force is not smooth and cannot
                     // be extrapolated.

@@ -43,23 +43,24 @@ impl Modes {
         let (omega, damping): (Vec<f64>, Vec<f64>) =
             (0..count).map(|mode| settings.mode(model, mode)).unzip();
         let reduced = settings.is_reduced(model);
-        let (mut made, mut flows) = (Vec::with_capacity(count), Vec::new());
+        let (mut made, mut branches) = (Vec::with_capacity(count), Vec::new());
         for (&omega, &c) in omega.iter().zip(&damping) {
             match settings.relaxation {
                 None if reduced => made.push(Coefficients::reduced(omega, c, h)?),
                 None => made.push(Coefficients::new(settings.integrator, omega, c, h)?),
                 Some(relaxation) => {
-                    let (one, flow) = Coefficients::relaxing(settings.integrator, omega, c, relaxation, h)?;
+                    let (one, viscoelastic) =
+                        Coefficients::relaxing(settings.integrator, omega, c, relaxation, h)?;
                     made.push(one);
-                    flows.push(flow);
+                    branches.push(viscoelastic);
                 }
             }
         }
         let viscous = settings.relaxation.map(|_| Viscous {
-            onto: std::array::from_fn(|row| flows.iter().map(|f| f.onto[row]).collect()),
-            free: std::array::from_fn(|column| flows.iter().map(|f| f.free[column]).collect()),
-            carry: flows.iter().map(|f| f.carry).collect(),
-            response: flows.iter().map(|f| f.response).collect(),
+            onto: std::array::from_fn(|row| branches.iter().map(|f| f.onto[row]).collect()),
+            free: std::array::from_fn(|column| branches.iter().map(|f| f.free[column]).collect()),
+            carry: branches.iter().map(|f| f.carry).collect(),
+            response: branches.iter().map(|f| f.response).collect(),
         });
         Ok(Self {
             omega,

@@ -154,14 +154,14 @@ impl Frame {
         /// Largest value of `|I^-1| |l| h` in one piece. The fixed point below then converges by a
         /// factor of two or more per round.
         const PIECE: f64 = 1.0;
-        const MOST_PIECES: f64 = 64.0;
+        const MAX_PIECES: f64 = 64.0;
         const ROUNDS: usize = 40;
         let inverse = inverse_inertia(model);
         let fastest = inverse.norm() * self.spin.norm();
         if fastest == 0.0 {
             return;
         }
-        let pieces = (fastest * h / PIECE).ceil().clamp(1.0, MOST_PIECES);
+        let pieces = (fastest * h / PIECE).ceil().clamp(1.0, MAX_PIECES);
         let h = h / pieces;
         for _ in 0..pieces as usize {
             let before = self.rotation.inverse() * self.spin;

@@ -56,7 +56,7 @@ pub struct StepSettings {
     /// `true`.
     pub warp: bool,
     /// Number of Newton corrections of the hands in one step, 1 to
-    /// [`StepSettings::MOST_CORRECTIONS`]. With linear elasticity they only have an effect with
+    /// [`StepSettings::MAX_CORRECTIONS`]. With linear elasticity they only have an effect with
     /// warp. With reduced elasticity they are the least number of Newton rounds of
     /// the whole step, which goes on to the maximum where it converges slowly. Default: 2.
     pub corrections: u8,
@@ -95,7 +95,7 @@ impl Default for StepSettings {
 
 impl StepSettings {
     /// Maximum number of Newton corrections in one step.
-    pub const MOST_CORRECTIONS: u8 = 8;
+    pub const MAX_CORRECTIONS: u8 = 8;
 
     /// Checks all ranges, also for settings from a network.
     ///
@@ -107,7 +107,7 @@ impl StepSettings {
         let sound = (1e-6..=1e6).contains(&stiffness);
         StepError::check("stiffness_scale", "1e-6 to 1e6", sound, stiffness)?;
         let corrections = self.corrections;
-        let sound = (1..=Self::MOST_CORRECTIONS).contains(&corrections);
+        let sound = (1..=Self::MAX_CORRECTIONS).contains(&corrections);
         StepError::check("corrections", "1 to 8", sound, corrections.into())?;
         if let Integrator::GeneralizedAlpha { rho_inf } = self.integrator {
             StepError::check("rho_inf", "0 to 1", (0.0..=1.0).contains(&rho_inf), rho_inf)?;

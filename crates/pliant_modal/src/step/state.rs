@@ -46,14 +46,14 @@ impl State {
 
     /// Limit on the magnitude of all numbers (kg^1/2 m and similar units). Above it, squares of
     /// coordinates and velocities may overflow in a step.
-    const MOST: f64 = 1e100;
+    const MAX: f64 = 1e100;
 
     /// Whether all numbers are small enough that a step without hands and pushes stays finite.
     pub(crate) fn is_moderate(&self) -> bool {
         let frame = &self.frame;
         let rigid = frame.velocity().into_iter().chain(frame.spin()).chain(frame.center());
         let modes = [&self.q, &self.v, &self.a, &self.f, &self.z, &self.s].into_iter().flatten().copied();
-        modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
+        modes.chain(rigid).all(|x| x.abs() <= Self::MAX)
     }
 
     /// Sets the body to rest, undeformed, at the pose of its frame. The frame returns to the origin
@@ -62,7 +62,7 @@ impl State {
         for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z, &mut self.s] {
             slice.fill(0.0);
         }
-        self.frame.stop(Self::MOST);
+        self.frame.stop(Self::MAX);
     }
 
     /// Name of the first quantity that is not finite, if any.
@@ -71,7 +71,7 @@ impl State {
             ("modal coordinates", &self.q),
             ("modal velocities", &self.v),
             ("modal accelerations", &self.a),
-            ("modal flows", &self.z),
+            ("modal viscoelastic states", &self.z),
             ("coordinates of held patches", &self.s),
         ];
         let bad = named.into_iter().find(|(_, slice)| slice.iter().any(|x| !x.is_finite()));

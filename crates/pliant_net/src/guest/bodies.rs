@@ -47,7 +47,7 @@ impl NetGuest {
         // guest accepts.
         let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
         let now = self.now();
-        self.line.keep_model(now, &model);
+        self.source.keep_model(now, &model);
         let handle = world.get_resource_mut::<Assets<ModalAsset>>().map(|mut assets| {
             let known = assets.iter().find(|(_, asset)| asset.0.hash() == model.hash()).map(|(id, _)| id);
             let known = known.and_then(|id| assets.get_strong_handle(id));

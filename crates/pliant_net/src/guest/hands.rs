@@ -126,7 +126,7 @@ impl HandPath {
 
 /// Number of ticks for which an unchanged target is sent. The host then knows that the hand stands
 /// still, and need not extrapolate.
-const SAID: u8 = 6;
+const REST_REPEATS: u8 = 6;
 /// Samples of the hands per tick.
 const READS: f64 = 4.0;
 /// Longest frame that is divided into parts, s.
@@ -161,7 +161,7 @@ impl NetGuest {
                 let due = if steps { view.tick() != sent.tick } else { k == parts };
                 let target = sent.path.mean(at, tick);
                 sent.times = if target == sent.target { sent.times } else { 0 };
-                let enough = if steps { SAID } else { 1 };
+                let enough = if steps { REST_REPEATS } else { 1 };
                 if !due || sent.times >= enough {
                     continue;
                 }

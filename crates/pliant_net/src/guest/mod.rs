@@ -35,7 +35,7 @@ pub(crate) use interest::{look, send_interest};
 pub(crate) use session::receive;
 pub(crate) use show::show;
 
-use crate::recording::{Recording, RecordingError, SessionRecorder};
+use crate::recording::{RecordingError, SessionRecorder, SessionRecording};
 
 /// How to join a session.
 #[derive(Debug)]
@@ -112,7 +112,7 @@ pub enum GuestState {
 /// The session that this app has joined.
 #[derive(Resource)]
 pub struct NetGuest {
-    line: Source,
+    source: Source,
     config: JoinConfig,
     began: Instant,
     state: GuestState,
@@ -144,13 +144,13 @@ impl NetGuest {
         Ok(Self::new(config, Source::Quic { endpoint, recorder }))
     }
 
-    pub(crate) fn replay(config: JoinConfig, recording: Recording) -> Self {
+    pub(crate) fn replay(config: JoinConfig, recording: SessionRecording) -> Self {
         Self::new(config, Source::replay(recording))
     }
 
-    fn new(config: JoinConfig, line: Source) -> Self {
+    fn new(config: JoinConfig, source: Source) -> Self {
         Self {
-            line,
+            source,
             config,
             began: Instant::now(),
             state: GuestState::Joining,
@@ -210,19 +210,19 @@ impl NetGuest {
 
     /// Returns the emulated link under the session, if there is one.
     pub fn emulation(&self) -> Option<Emulation> {
-        self.line.endpoint().and_then(Endpoint::emulation)
+        self.source.endpoint().and_then(Endpoint::emulation)
     }
 
     /// Sets, replaces or removes the emulated link under the session, at any time.
     pub fn set_emulation(&self, emulation: Option<Emulation>) {
-        if let Some(endpoint) = self.line.endpoint() {
+        if let Some(endpoint) = self.source.endpoint() {
             endpoint.set_emulation(emulation);
         }
     }
 
     /// Returns the transport endpoint. `None` for a replay.
     pub fn endpoint(&self) -> Option<&Endpoint> {
-        self.line.endpoint()
+        self.source.endpoint()
     }
 
     fn now(&self) -> Duration {
@@ -232,13 +232,13 @@ impl NetGuest {
     fn flush(&mut self) {
         let Some(session) = &mut self.session else { return };
         while let Some(output) = session.poll_output() {
-            self.line.send(output);
+            self.source.send(output);
         }
     }
 
     pub(crate) fn metrics(&mut self) -> NetStats {
         let mut stats = NetStats::default();
-        let line = self.line.stats();
+        let line = self.source.stats();
         let mut links = self.before;
         if let Some(session) = &self.session {
             links.add_counts(&session.stats());

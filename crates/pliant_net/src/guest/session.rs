@@ -51,7 +51,7 @@ pub(crate) fn receive(world: &mut World) {
         }
         loop {
             let now = guest.now();
-            let Some(came) = guest.line.poll(guest.began, now) else { break };
+            let Some(came) = guest.source.poll(guest.began, now) else { break };
             match came {
                 Came::Connected { role } => {
                     guest.role = role;
@@ -89,7 +89,7 @@ pub(crate) fn receive(world: &mut World) {
 impl NetGuest {
     /// Starts a session on an open connection.
     fn greet(&mut self, world: &World, now: Duration) -> Result<(), StreamError> {
-        let most = self.line.max_datagram_size().unwrap_or(0);
+        let most = self.source.max_datagram_size().unwrap_or(0);
         let config = pliant_stream::GuestSessionConfig {
             name: shortened(&self.config.name).to_owned(),
             recovery: self.config.recovery,
@@ -154,7 +154,7 @@ impl NetGuest {
             Full => self.retry.was_in,
             _ => false,
         };
-        if may_come_back && !self.line.is_replay() {
+        if may_come_back && !self.source.is_replay() {
             self.lost(world, now, reason);
         } else {
             self.close(world, reason);
@@ -171,7 +171,7 @@ impl NetGuest {
         if self.retry.next.is_none() {
             self.retry.pause = (self.retry.pause * 2).clamp(FIRST_PAUSE, LONGEST_PAUSE);
             self.retry.attempts += 1;
-            let key = self.line.endpoint().map_or(Fingerprint([0; 32]), Endpoint::fingerprint);
+            let key = self.source.endpoint().map_or(Fingerprint([0; 32]), Endpoint::fingerprint);
             self.retry.next = Some(now + retry_pause(self.retry.pause, key, self.retry.attempts));
         }
         self.flush();
@@ -190,7 +190,7 @@ impl NetGuest {
     fn try_again(&mut self, world: &mut World, now: Duration) {
         if self.retry.next.is_some_and(|due| now >= due) {
             self.retry.next = None;
-            self.line.rejoin();
+            self.source.rejoin();
         }
         // While the connection is lost, nothing says that the host has removed its bodies.
         let inside = matches!(self.state, GuestState::In { .. });
@@ -213,7 +213,7 @@ impl NetGuest {
         }
         info!("the session is over: {reason}");
         self.flush();
-        self.line.close();
+        self.source.close();
         self.state = GuestState::Closed { reason };
         self.leave_session(world);
         world.write_message(SessionClosed { reason });
@@ -247,7 +247,7 @@ impl NetGuest {
                 // Both ends have stopped receiving from each other, so the guest connects again.
                 GuestEvent::Closed { reason: DisconnectReason::Silent | DisconnectReason::Lost } => {
                     self.flush();
-                    self.line.close();
+                    self.source.close();
                     let now = self.now();
                     self.lost(world, now, DisconnectReason::Silent);
                 }

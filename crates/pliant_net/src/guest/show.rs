@@ -27,13 +27,13 @@ pub(crate) fn show(
     let most_force = guest.config.most_force.max(0.0);
     let now = guest.now();
     let Some(session) = guest.session.as_mut() else { return };
-    if let Some(most) = guest.line.max_datagram_size() {
+    if let Some(most) = guest.source.max_datagram_size() {
         session.set_max_datagram(most);
     }
     guest.advance(now);
     let Some(session) = guest.session.as_mut() else { return };
     // In a replay no hand is local, so all hands are shown as remote.
-    let user = session.user().filter(|_| !guest.line.is_replay());
+    let user = session.user().filter(|_| !guest.source.is_replay());
     let step = session.step();
     for (&id, followed) in &mut guest.bodies {
         let Some(view) = session.body(id) else { continue };

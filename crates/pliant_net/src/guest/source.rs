@@ -8,13 +8,13 @@ use pliant_modal::ModalModel;
 use pliant_stream::{Channel, DisconnectReason, Output, PeerId};
 use tracing::debug;
 
-use crate::recording::{Recording, SessionRecord, SessionRecorder};
+use crate::recording::{SessionRecord, SessionRecorder, SessionRecording};
 use crate::transport::{Endpoint, Event, PeerStats, Role};
 
 /// The guest's transport source.
 pub(crate) enum Source {
     Quic { endpoint: Endpoint, recorder: Option<SessionRecorder> },
-    Replay { recording: Recording, max_datagram: usize, over: bool },
+    Replay { recording: SessionRecording, max_datagram: usize, over: bool },
 }
 
 /// A received event, with its time of arrival where the session needs it.
@@ -26,7 +26,7 @@ pub(crate) enum Came {
 }
 
 impl Source {
-    pub(crate) fn replay(recording: Recording) -> Self {
+    pub(crate) fn replay(recording: SessionRecording) -> Self {
         Self::Replay { recording, max_datagram: 0, over: false }
     }
 
@@ -73,7 +73,7 @@ impl Source {
                         *over |= recording.is_over();
                         Came::Closed { reason }
                     }
-                    // [`Recording::open`] has already read the models.
+                    // [`SessionRecording::open`] has already read the models.
                     SessionRecord::Model(_) => return self.poll(began, now),
                 })
             }

@@ -8,7 +8,7 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::{BodyState, Driven, Grab, GrabForce, Grabs, PliantTick};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, GrabKey, GrabState, Pose, StepSettings, TickState, UserId, UserLinkInfo};
+use pliant_stream::{BodyId, GrabKey, GrabState, RigidState, StepSettings, TickState, UserId, UserLinkInfo};
 
 use super::NetHost;
 use super::hands::GuestGrab;
@@ -96,7 +96,7 @@ pub(crate) fn publish(
             }
         }
         let body = state.body();
-        let pose = body.model().is_free().then(|| Pose::of(body));
+        let pose = body.model().is_free().then(|| RigidState::of(body));
         let step = TickState {
             tick: tick.0,
             q: body.q(),

@@ -100,7 +100,7 @@ impl NetPeer {
         }
         let address = self.invite_for(peer).to_string();
         let (Some(session), Some(other)) = (&mut self.session, self.others.get_mut(&peer)) else { return };
-        session.tell_address(peer, address);
+        session.set_address_for(peer, address);
         let added = if opened {
             session.connect(now, peer, other.number, most)
         } else {

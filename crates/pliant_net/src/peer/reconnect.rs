@@ -25,7 +25,7 @@ pub(super) struct Missed {
 /// Pause between two attempts to connect, which is half to one and a half times as long.
 const PAUSE: Duration = Duration::from_secs(1);
 /// Most lost peers that are tracked. The one that was lost first is given up first.
-const MOST_MISSED: usize = 64;
+const MAX_MISSED: usize = 64;
 
 /// Returns whether the peers have lost each other, and neither has sent the other away.
 pub(super) fn is_loss(reason: DisconnectReason) -> bool {
@@ -56,7 +56,7 @@ impl NetPeer {
             return;
         }
         debug!("user {} is looked for", number.0);
-        if self.missed.len() >= MOST_MISSED {
+        if self.missed.len() >= MAX_MISSED {
             self.missed.remove(0);
         }
         self.missed.push(Missed {

@@ -7,7 +7,7 @@ use super::NetPeer;
 use crate::transport::{Access, Fingerprint, Grant, Invite, Token};
 
 /// Most tokens that are valid at one time beside the application's.
-const MOST_TOKENS: usize = 4096;
+const MAX_TOKENS: usize = 4096;
 
 impl NetPeer {
     /// Returns the invite to this peer that the peer at a connection is told: where tokens are
@@ -21,7 +21,7 @@ impl NetPeer {
         }
         match Token::generate() {
             Ok(token) => {
-                if self.tokens.len() >= MOST_TOKENS {
+                if self.tokens.len() >= MAX_TOKENS {
                     // Those of peers that are here, or were here not long ago, stay.
                     let known = &self.known;
                     self.tokens.retain(|key, _| known.number_of(key).is_some());

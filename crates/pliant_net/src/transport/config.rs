@@ -103,7 +103,7 @@ pub struct Limits {
     /// Default: 1 MiB for a host, 256 MiB for a guest (because models are sent as messages).
     pub message: usize,
     /// Most bytes of messages that are not yet sent or not yet read, for each peer and direction. A
-    /// single message is accepted whatever its length. Towards the peer, a full queue gives
+    /// single message is accepted whatever its length. Toward the peer, a full queue gives
     /// [`SendError::QueueFull`](super::SendError::QueueFull). From the peer, flow control applies,
     /// and no more than the longest message waits. Default: 64 MiB.
     pub queued_messages: usize,

@@ -76,7 +76,7 @@ pub(super) async fn run(
             // The application decides when the next attempt begins.
             tokio::select! {
                 () = shared.stop.notified() => break,
-                () = shared.again.notified() => {}
+                () = shared.reconnect.notified() => {}
             }
         },
     }

@@ -147,8 +147,8 @@ pub(super) struct EndpointShared {
     pub(super) next_peer: AtomicU64,
     pub(super) stopping: AtomicBool,
     pub(super) stop: Notify,
-    /// Notified when a guest is to join again.
-    pub(super) again: Notify,
+    /// Notified when a guest is to reconnect.
+    pub(super) reconnect: Notify,
     pub(super) access: Mutex<Arc<Access>>,
     pub(super) places: Arc<Mutex<Places>>,
     pub(super) emulator: Arc<Emulator>,
@@ -163,7 +163,7 @@ impl EndpointShared {
             next_peer: AtomicU64::new(first_peer.0),
             stopping: AtomicBool::new(false),
             stop: Notify::new(),
-            again: Notify::new(),
+            reconnect: Notify::new(),
             access: Mutex::new(Arc::new(access)),
             places: Arc::default(),
             emulator: Arc::default(),
@@ -295,7 +295,7 @@ impl Endpoint {
     /// is open, and for a host.
     pub fn rejoin(&self) {
         if self.peers().is_empty() {
-            self.shared.again.notify_one();
+            self.shared.reconnect.notify_one();
         }
     }
 

@@ -81,8 +81,8 @@ pub(super) fn parse_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
 
 /// Cuts text from the network, so that an error message stays short whatever its input.
 pub(super) fn shortened(text: &str) -> String {
-    const MOST: usize = 80;
-    match text.char_indices().nth(MOST) {
+    const MAX: usize = 80;
+    match text.char_indices().nth(MAX) {
         Some((end, _)) => format!("{}… ({} bytes)", &text[..end], text.len()),
         None => text.to_owned(),
     }

@@ -11,7 +11,7 @@ use super::config::Limits;
 use super::queue::lock;
 
 /// Most addresses whose arrivals are counted.
-const MOST_ADDRESSES: usize = 4096;
+const MAX_ADDRESSES: usize = 4096;
 
 /// The connections and handshakes of a host.
 ///
@@ -105,11 +105,11 @@ impl Places {
 
     /// Forgets addresses that have not come for a while, or that have no place.
     fn forget(&mut self, now: Instant, burst: f64, rate: f64) {
-        if self.addresses.len() < MOST_ADDRESSES {
+        if self.addresses.len() < MAX_ADDRESSES {
             return;
         }
         self.addresses.retain(|_, a| a.places > 0 || a.left_at(now, burst, rate) < burst);
-        while self.addresses.len() >= MOST_ADDRESSES {
+        while self.addresses.len() >= MAX_ADDRESSES {
             let idle = self.addresses.iter().filter(|(_, arrivals)| arrivals.places == 0);
             let Some(oldest) = idle.min_by_key(|(_, arrivals)| arrivals.at).map(|(&address, _)| address)
             else {
@@ -211,6 +211,6 @@ mod tests {
                 places.free(id);
             }
         }
-        assert!(places.addresses.len() <= MOST_ADDRESSES, "{}", places.addresses.len());
+        assert!(places.addresses.len() <= MAX_ADDRESSES, "{}", places.addresses.len());
     }
 }

@@ -52,7 +52,7 @@ impl FromPeer {
 }
 
 /// Most peers with unread events before the host refuses new guests.
-const MOST_UNREAD: usize = 4096;
+const MAX_UNREAD: usize = 4096;
 /// Cost of a queued message beside its bytes, bytes. It bounds the number of empty messages.
 const MESSAGE_COST: usize = 64;
 
@@ -142,7 +142,7 @@ impl Inbox {
     }
 
     pub(super) fn overloaded(&self) -> bool {
-        lock(&self.0).peers.len() >= MOST_UNREAD
+        lock(&self.0).peers.len() >= MAX_UNREAD
     }
 
     /// Queues a datagram. Returns how many datagrams were dropped.

@@ -32,7 +32,7 @@ impl People<'_, '_> {
         for hand in self.seen.get(body).into_iter().flat_map(|seen| &seen.0) {
             let user = self.users.iter().map(|(user, _)| user).find(|user| user.id == hand.user);
             let number = hand.user.0;
-            let of_user = |key: &HandKey| matches!(key, HandKey::Seen { user, .. } if *user == number);
+            let of_user = |key: &HandKey| matches!(key, HandKey::Remote { user, .. } if *user == number);
             let nth = views.iter().filter(|(key, _)| of_user(key)).count();
             let view = HandView {
                 name: user.map_or_else(|| format!("user {number}"), |user| user.name.clone()),
@@ -40,7 +40,7 @@ impl People<'_, '_> {
                 force: hand.reaction.length(),
                 ..default()
             };
-            views.push((HandKey::Seen { body, user: number, nth }, view));
+            views.push((HandKey::Remote { body, user: number, nth }, view));
         }
         views
     }

@@ -37,7 +37,7 @@ pub(super) enum HandKey {
     Grab(Entity),
     /// A remote hand: its body, its user, and its number among that user's hands on the body.
     #[cfg(feature = "net")]
-    Seen { body: Entity, user: u16, nth: usize },
+    Remote { body: Entity, user: u16, nth: usize },
 }
 
 #[derive(SystemParam)]

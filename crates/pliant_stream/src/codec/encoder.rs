@@ -425,13 +425,13 @@ impl Encoder {
             self.scratch.push(if exact {
                 (truth_at(state.q, k) - free_q) / (beta * h * h)
             } else {
-                // Use the host's own acceleration plus a correction towards the true state. For
+                // Use the host's own acceleration plus a correction toward the true state. For
                 // average acceleration these gains put all three poles of the error within 0.62.
                 let (eq, ev) = (self.truth.state.q[k] - q, self.truth.state.v[k] - v);
                 truth_at(state.a, k) + 0.1 * eq / (h * h) + 0.5 * ev / h
             });
         }
-        let mut accelerations = Accelerations::quantise(coding, &self.scratch, unit, &self.quanta);
+        let mut accelerations = Accelerations::quantize(coding, &self.scratch, unit, &self.quanta);
         // If the accelerations do not fit in the datagram, use coarser steps. The closed loop
         // corrects the error in later ticks. Grabs have lower priority: those that do not fit get a
         // datagram of their own.
@@ -440,7 +440,7 @@ impl Encoder {
         let mut coarser = unit;
         while accelerations.bytes() > room && coarser < 1e9 && coding == AccelerationCoding::Visible {
             coarser *= 4.0;
-            accelerations = Accelerations::quantise(coding, &self.scratch, coarser, &self.quanta);
+            accelerations = Accelerations::quantize(coding, &self.scratch, coarser, &self.quanta);
         }
         for (k, a) in self.scratch.iter_mut().enumerate() {
             *a = accelerations.get(k, &self.quanta);
@@ -530,7 +530,7 @@ impl Encoder {
         self.entries.clear();
         self.entries.extend(self.chosen.iter().map(entry));
         let viscoelastic = !self.mirror.state.z.is_empty();
-        let mut slice = Slice::quantise(&self.entries, unit, self.loaded, viscoelastic, &self.quanta);
+        let mut slice = Slice::quantize(&self.entries, unit, self.loaded, viscoelastic, &self.quanta);
         let mut count = slice.steps.len();
         while count > 0 && 3 + frame.bytes() + slice.bytes_of(count) > room {
             // Remove modes first, then repeats.

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 /// Largest number of events that wait for the application.
-const MOST: usize = 4096;
+const MAX: usize = 4096;
 
 /// Events in order. When the queue is full, the oldest event is dropped and counted.
 #[derive(Debug)]
@@ -20,7 +20,7 @@ impl<T> Default for Events<T> {
 
 impl<T> Events<T> {
     pub(crate) fn push(&mut self, event: T) {
-        if self.waiting.len() >= MOST {
+        if self.waiting.len() >= MAX {
             self.waiting.pop_front();
             self.dropped += 1;
         }

@@ -12,7 +12,7 @@ use crate::newmark::{Newmark, ViscoelasticFilter};
 use crate::prediction::{BodyCopy, HandState, Ring, Rollback, VisualCopy};
 use crate::recovery::Forecast;
 use crate::replica::Replica;
-use crate::state::{BodyId, GrabKey, GrabState, Pose, State, Tick, UserId};
+use crate::state::{BodyId, GrabKey, GrabState, RigidState, State, Tick, UserId};
 use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerHandState};
 
 /// Correction of the state for a late input.
@@ -112,14 +112,14 @@ impl PeerBody {
     }
 
     /// The visual rigid frame of a free body; `None` for an anchored one.
-    pub fn pose(&self) -> Option<Pose> {
+    pub fn pose(&self) -> Option<RigidState> {
         self.visual.pose
     }
 
     /// The rigid frame of a free body after a remembered tick.
-    pub(crate) fn past_pose(&self, tick: Tick) -> Option<Pose> {
+    pub(crate) fn past_pose(&self, tick: Tick) -> Option<RigidState> {
         let past = self.past(tick)?;
-        self.model.is_free().then(|| Pose::of_frame(&self.model, &past.frame))
+        self.model.is_free().then(|| RigidState::of_frame(&self.model, &past.frame))
     }
 
     /// Returns the checksum of a remembered tick and the magnitude that scales its tolerance.

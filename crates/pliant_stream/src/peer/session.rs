@@ -149,7 +149,7 @@ impl PeerSession {
     /// Sets where the peer at a connection, and those to whom it passes it on, reach this peer,
     /// instead of [`PeerSessionConfig::address`]. Call this before [`PeerSession::connect`] or
     /// [`PeerSession::accept`]. An address of more than 512 bytes has no effect.
-    pub fn tell_address(&mut self, peer: PeerId, address: String) {
+    pub fn set_address_for(&mut self, peer: PeerId, address: String) {
         if address.len() <= MAX_ADDRESS {
             self.addresses.insert(peer, address);
         }
@@ -423,7 +423,7 @@ impl PeerSession {
     }
 
     /// The rigid frame of a free body after one of the last 128 ticks.
-    pub fn pose_at(&self, body: BodyId, tick: Tick) -> Option<crate::Pose> {
+    pub fn pose_at(&self, body: BodyId, tick: Tick) -> Option<crate::RigidState> {
         self.bodies.get(&body)?.past_pose(tick)
     }
 

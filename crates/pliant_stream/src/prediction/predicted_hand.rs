@@ -21,7 +21,7 @@ use pliant_modal::{Frame, GrabConfig, Hand, HeldShapes, Hold, Load, RigidMotion}
 use super::{BodyCopy, HandState, VisualCopy};
 use crate::recovery::{Forecast, Receiver};
 use crate::replica::{self, Replica};
-use crate::state::{GrabKey, Pose, State, Tick, UserId};
+use crate::state::{GrabKey, RigidState, State, Tick, UserId};
 
 /// Number of targets remembered, which also bounds the lead, ticks.
 const REMEMBERED: usize = 64;
@@ -146,7 +146,7 @@ impl PredictedHand {
         let others = others.map(|g| (g.vertex, g.radius, g.reaction));
         let own = self.grabs.iter().filter(|g| active && g.target.is_some());
         let own = own.map(|g| (g.vertex, g.radius, std::array::from_fn(|k| g.reaction[k] + g.offset[k])));
-        shaped.settle(&mut self.settled, others.chain(own));
+        shaped.equilibrate_columns(&mut self.settled, others.chain(own));
         self.columns.clone_from(&self.settled.s);
     }
 
@@ -166,7 +166,7 @@ impl PredictedHand {
     }
 
     /// The rigid frame that belongs to [`PredictedHand::visual`], for a free body.
-    pub fn pose(&self) -> Option<Pose> {
+    pub fn pose(&self) -> Option<RigidState> {
         self.visual.pose
     }
 
@@ -347,8 +347,9 @@ impl PredictedHand {
             let Some(known) = receiver.hands().iter().find(|hand| hand.key == key) else { continue };
             let Some(patch) = self.replica.patch(g.vertex, g.radius) else { continue };
             let pull = turn.rotation().inverse() * known.mean;
-            let hand = Hand { flow: g.viscoelastic, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
-            g.viscoelastic = self.replica.kernel().flow(&hand, pull);
+            let hand =
+                Hand { viscoelastic: g.viscoelastic, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
+            g.viscoelastic = self.replica.kernel().viscoelastic_after(&hand, pull);
         }
     }
 

@@ -3,14 +3,14 @@
 use pliant_modal::ModalModel;
 
 use crate::recovery::{Blend, PoseBlend};
-use crate::state::{Pose, State};
+use crate::state::{RigidState, State};
 
 /// The visual state of a copy, with its offsets from the copy.
 #[derive(Debug)]
 pub(crate) struct VisualCopy {
     pub state: State,
     /// The visual rigid frame of a free body.
-    pub pose: Option<Pose>,
+    pub pose: Option<RigidState>,
     blend: Blend,
     pose_blend: PoseBlend,
 }
@@ -48,7 +48,7 @@ impl VisualCopy {
             before.v.iter().zip(&now.v).map(|(b, n)| b - n),
         );
         if model.is_free() {
-            let of = |state: &State| Pose::of_frame(model, &state.frame);
+            let of = |state: &State| RigidState::of_frame(model, &state.frame);
             self.pose_blend.add(&of(before), &of(now));
         }
     }
@@ -57,7 +57,7 @@ impl VisualCopy {
     pub(crate) fn show(&mut self, model: &ModalModel, now: &State) {
         self.state.clone_from(now);
         self.blend.apply(&mut self.state.q, &mut self.state.v);
-        let pose = model.is_free().then(|| Pose::of_frame(model, &now.frame));
+        let pose = model.is_free().then(|| RigidState::of_frame(model, &now.frame));
         self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::codec::quantization::Quanta;
 use crate::prediction::Ring;
-use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
+use crate::state::{GrabKey, GrabState, MAX_GRABS, RigidState, Tick};
 use crate::wire::{FrameGrab, SliceEntry, TickFrame};
 
 use nalgebra::{UnitQuaternion, Vector3};
@@ -29,7 +29,7 @@ pub struct TickData {
     /// The grabs that were held, with their reactions and the displacements of their patches.
     pub grabs: Vec<FrameGrab>,
     /// Rigid pose of a free body.
-    pub pose: Option<Pose>,
+    pub pose: Option<RigidState>,
     /// Part of the absolute state.
     pub slice: Vec<SliceEntry>,
     /// Checksum of the state.
@@ -75,7 +75,7 @@ impl History {
 
     /// The rigid pose at `tick`, with `h` seconds per tick: received, interpolated between
     /// neighbors, or extrapolated from the last poses. Returns `None` when no recent pose is known.
-    pub fn pose(&self, tick: Tick, h: f64) -> Option<Pose> {
+    pub fn pose(&self, tick: Tick, h: f64) -> Option<RigidState> {
         let at = |t: Tick| self.known(t).and_then(|d| d.pose);
         if let Some(pose) = at(tick) {
             return Some(pose);
@@ -227,11 +227,11 @@ impl History {
 
 /// Extrapolates a pose by `seconds` with its own twist. The pose keeps the acceleration `faster`
 /// (m/s^2) for at most `FALL` seconds.
-fn go_on(pose: &Pose, faster: [f64; 3], seconds: f64) -> Pose {
+fn go_on(pose: &RigidState, faster: [f64; 3], seconds: f64) -> RigidState {
     let Some(turn) = pose.turn() else { return *pose };
     let turned = UnitQuaternion::from_scaled_axis(Vector3::from(pose.angular) * seconds) * turn;
     let (gaining, after) = (seconds.min(FALL), (seconds - FALL).max(0.0));
-    Pose {
+    RigidState {
         position: std::array::from_fn(|k| {
             let gained = faster[k] * gaining;
             pose.position[k] + pose.linear[k] * seconds + gained * (0.5 * gaining + after)
@@ -243,12 +243,12 @@ fn go_on(pose: &Pose, faster: [f64; 3], seconds: f64) -> Pose {
 }
 
 /// Interpolates between two poses. `share` 0 gives `a` and 1 gives `b`.
-fn between(a: &Pose, b: &Pose, share: f64) -> Pose {
+fn between(a: &RigidState, b: &RigidState, share: f64) -> RigidState {
     let (Some(from), Some(to)) = (a.turn(), b.turn()) else { return *a };
     let way = (to * from.inverse()).scaled_axis() * share;
     let turn = UnitQuaternion::from_scaled_axis(way) * from;
     let mix = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] + share * (b[k] - a[k]));
-    Pose {
+    RigidState {
         position: mix(a.position, b.position),
         rotation: [turn.i, turn.j, turn.k, turn.w],
         linear: mix(a.linear, b.linear),

@@ -3,7 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 
 use super::Blend;
-use crate::state::Pose;
+use crate::state::RigidState;
 
 /// Offsets of a pose that still fade: 3 of position (m) and 3 of rotation (rotation vector, rad).
 #[derive(Debug, Clone)]
@@ -29,7 +29,7 @@ impl PoseBlend {
 
     /// Adds the offset of a correction that moved the confirmed pose from `before` to `now`. The
     /// visual pose does not jump, and the offset fades.
-    pub fn add(&mut self, before: &Pose, now: &Pose) {
+    pub fn add(&mut self, before: &RigidState, now: &RigidState) {
         let (Some(old), Some(new)) = (before.turn(), now.turn()) else { return };
         let turn = (old * new.inverse()).scaled_axis();
         let place = (0..3).map(|k| before.position[k] - now.position[k]).chain(turn.iter().copied());
@@ -44,13 +44,13 @@ impl PoseBlend {
     }
 
     /// The visual pose for a confirmed pose.
-    pub fn apply(&self, pose: &Pose) -> Pose {
+    pub fn apply(&self, pose: &RigidState) -> RigidState {
         let Some(turn) = pose.turn().filter(|_| !self.is_empty()) else { return *pose };
         let (mut place, mut speed) = ([0.0; 6], [0.0; 6]);
         self.blend.apply(&mut place, &mut speed);
         let offset = UnitQuaternion::from_scaled_axis(Vector3::new(place[3], place[4], place[5]));
         let q = offset * turn;
-        Pose {
+        RigidState {
             position: std::array::from_fn(|k| pose.position[k] + place[k]),
             rotation: [q.i, q.j, q.k, q.w],
             linear: std::array::from_fn(|k| pose.linear[k] + speed[k]),
@@ -66,8 +66,12 @@ mod tests {
     #[test]
     fn a_correction_moves_nothing_at_once_and_is_gone_after_its_ticks() {
         let half = 0.5_f64.sqrt();
-        let before = Pose { position: [1.0, 2.0, 3.0], rotation: [0.0, 0.0, half, half], ..Pose::default() };
-        let now = Pose { linear: [0.5, 0.0, 0.0], ..Pose::default() };
+        let before = RigidState {
+            position: [1.0, 2.0, 3.0],
+            rotation: [0.0, 0.0, half, half],
+            ..RigidState::default()
+        };
+        let now = RigidState { linear: [0.5, 0.0, 0.0], ..RigidState::default() };
         let mut blend = PoseBlend::new(0.025, 8);
         blend.add(&before, &now);
         let visual = blend.apply(&now);

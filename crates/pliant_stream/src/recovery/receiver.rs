@@ -15,7 +15,7 @@ use crate::codec::quantization::Quanta;
 use crate::newmark::Newmark;
 use crate::prediction::{HandState, Ring};
 use crate::replica::{self, Replica};
-use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
+use crate::state::{GrabKey, GrabState, RigidState, State, Tick, UserId};
 use crate::wire::{SnapshotBytes, TickFrame};
 
 /// Number of disagreeing checksums in a row before the receiver wants a snapshot. A slice or a
@@ -79,8 +79,8 @@ pub struct Receiver {
     /// state.
     implied: [Vec<HandState>; 2],
     /// The best estimate of the rigid pose at the current tick, and the visual pose.
-    frame: Option<Pose>,
-    pose: Option<Pose>,
+    frame: Option<RigidState>,
+    pose: Option<RigidState>,
     pose_blend: PoseBlend,
     free: bool,
     counts: RepairCounts,
@@ -190,7 +190,7 @@ impl Receiver {
     }
 
     /// The best estimate of the rigid pose at the current tick. `None` if the body is not free.
-    pub(crate) fn frame(&self) -> Option<Pose> {
+    pub(crate) fn frame(&self) -> Option<RigidState> {
         self.frame
     }
 
@@ -213,7 +213,7 @@ impl Receiver {
     }
 
     /// The visual rigid pose at the current tick. `None` if the body is not free.
-    pub fn pose(&self) -> Option<Pose> {
+    pub fn pose(&self) -> Option<RigidState> {
         self.pose
     }
 

@@ -11,13 +11,13 @@ use crate::playout::PlayoutClock;
 use crate::prediction::{HitchGuard, PredictedHand, Ring};
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
-use crate::state::{BodyId, GrabKey, Placement, Pose, State, Tick, UserId};
+use crate::state::{BodyId, GrabKey, Placement, RigidState, State, Tick, UserId};
 use crate::wire::{BodyInfo, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes, TickFrame};
 
 /// Largest number of frames that wait for the snapshot.
 const WAITING: usize = HISTORY;
 /// Largest number of NACKs for one missing tick.
-const MOST_REQUESTS: u8 = 12;
+const MAX_REQUESTS: u8 = 12;
 /// Age beyond which a missing tick is not requested, ticks.
 const REQUEST_WITHIN: u64 = 200;
 /// Backlog beyond which the receiver does not catch up tick by tick, ticks. A snapshot is faster.
@@ -188,7 +188,7 @@ impl StreamedBody {
     }
 
     /// The rigid frame of a free body at the displayed tick.
-    pub fn pose(&self) -> Option<Pose> {
+    pub fn pose(&self) -> Option<RigidState> {
         self.receiver.as_ref().and_then(Receiver::pose)
     }
 
@@ -429,7 +429,7 @@ impl StreamedBody {
             if other {
                 *request = TickRequest { times: 0, next: now };
             }
-            if request.times >= MOST_REQUESTS || request.next > now {
+            if request.times >= MAX_REQUESTS || request.next > now {
                 continue;
             }
             let room = runs.len() < MAX_NACK_RUNS;
@@ -457,7 +457,7 @@ impl StreamedBody {
         (from..to)
             .filter(|t| history.known(*t).is_none())
             .filter_map(|t| self.requests.get(t))
-            .filter(|a| a.times > 0 && a.times < MOST_REQUESTS)
+            .filter(|a| a.times > 0 && a.times < MAX_REQUESTS)
             .map(|a| a.next)
             .min()
     }

@@ -17,7 +17,7 @@ use crate::wire::HostMessage;
 const CHUNK: usize = 16 * 1024;
 /// Unsent bytes in the transport beyond which no more of a model is sent: 1 MB/s in eight calls a
 /// second.
-const MOST_UNSENT: usize = 128 * 1024;
+const MAX_UNSENT: usize = 128 * 1024;
 /// Burst after a pause, in seconds of the rate for all guests. An application that calls ten times
 /// a second uses the whole rate.
 const BURST: f64 = 0.1;
@@ -53,7 +53,7 @@ impl Upload {
 /// Size of the next piece for a guest, bytes, if the transport has room.
 fn next_piece(peer: &GuestPeer) -> Option<usize> {
     let transfer = peer.transfers.front()?;
-    (peer.unsent < MOST_UNSENT).then(|| (transfer.bytes.len() - transfer.offset).min(CHUNK))
+    (peer.unsent < MAX_UNSENT).then(|| (transfer.bytes.len() - transfer.offset).min(CHUNK))
 }
 
 impl HostSession {

@@ -6,7 +6,7 @@ use super::bits::{BitReader, BitWriter, WIDTH_BITS, whole, width};
 use super::{Reader, Slice, Writer};
 use crate::StreamError;
 use crate::codec::quantization::Quanta;
-use crate::state::{BodyId, GrabKey, GrabState, MAX_GRABS, MAX_MODES, Pose, Tick, UserId};
+use crate::state::{BodyId, GrabKey, GrabState, MAX_GRABS, MAX_MODES, RigidState, Tick, UserId};
 
 const POSE: u8 = 1;
 const ACCELERATIONS: u8 = 2;
@@ -69,7 +69,7 @@ pub enum Accelerations {
 impl Accelerations {
     /// Rounds values to an encoding. `unit` (m) and `quanta` apply to
     /// [`AccelerationCoding::Visible`].
-    pub fn quantise(coding: AccelerationCoding, values: &[f64], unit: f32, quanta: &Quanta) -> Self {
+    pub fn quantize(coding: AccelerationCoding, values: &[f64], unit: f32, quanta: &Quanta) -> Self {
         match coding {
             AccelerationCoding::Visible => {
                 let step =
@@ -260,7 +260,7 @@ pub struct TickFrame {
     /// All grabs of the body, at most 64. In a part, the grabs of that part.
     pub grabs: Vec<FrameGrab>,
     /// Rigid frame of a free body.
-    pub pose: Option<Pose>,
+    pub pose: Option<RigidState>,
     /// Accelerations, for [`super::Payload::Accelerations`].
     pub accelerations: Option<Accelerations>,
     /// A part of the absolute state.
@@ -447,7 +447,7 @@ impl TickFrame {
     }
 }
 
-fn decode_pose(r: &mut Reader<'_>) -> Result<Pose, StreamError> {
+fn decode_pose(r: &mut Reader<'_>) -> Result<RigidState, StreamError> {
     let position = r.vector("pose position")?;
     let mut rotation = [0.0; 4];
     for x in &mut rotation {
@@ -462,5 +462,10 @@ fn decode_pose(r: &mut Reader<'_>) -> Result<Pose, StreamError> {
         });
     }
     rotation.iter_mut().for_each(|x| *x /= norm);
-    Ok(Pose { position, rotation, linear: r.vector24("pose linear")?, angular: r.vector24("pose angular")? })
+    Ok(RigidState {
+        position,
+        rotation,
+        linear: r.vector24("pose linear")?,
+        angular: r.vector24("pose angular")?,
+    })
 }

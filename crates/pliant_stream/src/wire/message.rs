@@ -272,7 +272,7 @@ impl GuestMessage {
             }
             Self::GrabBegin { radius, target, hold, .. } => {
                 check("radius", *radius >= 0.0 && in_range(&[*radius]), radius, "0..=1e9 m")?;
-                check("target", in_range(target), format!("{target:?}"), "finite metres")?;
+                check("target", in_range(target), format!("{target:?}"), "finite meters")?;
                 *hold = check_hold(*hold)?;
             }
             Self::GrabEnd { .. }

@@ -10,7 +10,7 @@ use crate::codec::quantization::Quanta;
 const MODE_BITS: u32 = 12;
 /// Bits of the `parts` byte.
 const LOAD: u8 = 1;
-const FLOW: u8 = 2;
+const VISCOELASTIC: u8 = 2;
 
 /// One mode of a slice.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -42,7 +42,7 @@ pub struct Slice {
 
 impl Slice {
     /// Quantizes a state for a slice, at most 255 modes.
-    pub fn quantise(
+    pub fn quantize(
         values: &[SliceEntry],
         unit: f32,
         loads: bool,
@@ -101,7 +101,7 @@ impl Slice {
 
     pub(crate) fn encode(&self, w: &mut Writer) {
         w.u8(self.steps.len() as u8);
-        w.u8(if self.loads { LOAD } else { 0 } | if self.viscoelastic { FLOW } else { 0 });
+        w.u8(if self.loads { LOAD } else { 0 } | if self.viscoelastic { VISCOELASTIC } else { 0 });
         w.f32(self.unit);
         let mut bits = BitWriter::new(w);
         for (mode, steps) in &self.steps {
@@ -118,14 +118,15 @@ impl Slice {
     pub(crate) fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
         let count = usize::from(r.u8("slice count")?);
         let parts = r.u8("slice parts")?;
-        if parts & !(LOAD | FLOW) != 0 {
+        if parts & !(LOAD | VISCOELASTIC) != 0 {
             let found = parts.to_string();
             return Err(StreamError::Invalid { what: "slice parts", found, expected: "bits 0 and 1 only" });
         }
         let unit = r.f32("slice unit")? as f32;
         // The capacity follows from the bytes present: a mode takes at least 22 bits.
         let steps = Vec::with_capacity(count.min(r.left() * 8 / 22));
-        let mut made = Self { unit, loads: parts & LOAD != 0, viscoelastic: parts & FLOW != 0, steps };
+        let mut made =
+            Self { unit, loads: parts & LOAD != 0, viscoelastic: parts & VISCOELASTIC != 0, steps };
         let mut bits = BitReader::new(r);
         for _ in 0..count {
             let mode = bits.take("slice mode", MODE_BITS)? as u16;

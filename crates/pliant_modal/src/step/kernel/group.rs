@@ -196,8 +196,9 @@ impl<P: Member> Group<'_, P> {
     fn check(&self) -> Result<(), StepError> {
         for member in 0..self.len() {
             let View { state, hands, .. } = self.view(member);
-            let sound =
-                |hand: &Hand| hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
+            let sound = |hand: &Hand| {
+                hand.pull.iter().chain(&hand.mean).chain(&hand.viscoelastic).all(|x| x.is_finite())
+            };
             let reaction = (!hands.iter().all(sound)).then_some("a reaction");
             if let Some(what) = state.non_finite().or(reaction) {
                 return Err(StepError::Diverged { what });

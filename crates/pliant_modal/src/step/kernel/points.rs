@@ -9,7 +9,7 @@ use super::{
 use crate::{
     StepError,
     contact::{
-        Clearance, ContactSites, Far, Guess, Look, Memory, Near, Obstacle, Place, Point, Shape, Site,
+        Clearance, ContactSites, Far, Guess, Look, Memory, Near, ObstacleShape, Place, Point, Shape, Site,
         SurfacePoint, Touched, Touching,
     },
     step::{Frame, State, Tangent},
@@ -40,7 +40,7 @@ const PARTS: u32 = 4;
 /// Difference of two distances that count as the same, as a share of the depth [`DEEP`].
 const SAME: f64 = 1e-3;
 
-fn carried(obstacle: &dyn Obstacle, point: &Vector3<f64>, h: f64) -> Result<Vector3<f64>, StepError> {
+fn carried(obstacle: &dyn ObstacleShape, point: &Vector3<f64>, h: f64) -> Result<Vector3<f64>, StepError> {
     let velocity = obstacle.velocity(point);
     crate::error::finite("velocity of an obstacle", velocity.as_slice())?;
     Ok(h * velocity)
@@ -139,7 +139,7 @@ fn begin_at_obstacle(
     view: &View<'_>,
     memory: &Memory,
     site: &Site,
-    obstacle: &dyn Obstacle,
+    obstacle: &dyn ObstacleShape,
 ) -> Result<Point, StepError> {
     let kernel = view.kernel;
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
@@ -783,7 +783,7 @@ fn follow(
 /// Follows a way from outside until it enters the obstacle. Returns the distance of its end to the
 /// plane at that place, and the plane's normal.
 fn march(
-    obstacle: &dyn Obstacle,
+    obstacle: &dyn ObstacleShape,
     start: &Vector3<f64>,
     way: &Vector3<f64>,
     begin: SurfacePoint,

@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::Kernel;
 use crate::{
     ModalModel, StepError,
-    contact::{Cloud, ContactSites, Contacts, Obstacle, Shape, Site, Sixes, SurfacePoint},
+    contact::{Cloud, ContactSites, Contacts, ObstacleShape, Shape, Site, Sixes, SurfacePoint},
     simd::dot,
     step::{Frame, Hand, Six, State, Tangent, tangent},
 };
@@ -67,7 +67,7 @@ pub(super) struct Located {
     pub(super) found: SurfacePoint,
 }
 
-pub(super) fn look(obstacle: &dyn Obstacle, point: &Vector3<f64>) -> Result<SurfacePoint, StepError> {
+pub(super) fn look(obstacle: &dyn ObstacleShape, point: &Vector3<f64>) -> Result<SurfacePoint, StepError> {
     let far = SurfacePoint { distance: f64::INFINITY, normal: Vector3::y() };
     // A state that has diverged is found by the step.
     if !point.iter().all(|x| x.is_finite()) {
@@ -102,7 +102,7 @@ impl Kernel {
     pub(super) fn locate(
         &self,
         site: &Site,
-        obstacle: &dyn Obstacle,
+        obstacle: &dyn ObstacleShape,
         frame: &Frame,
         q: &[f64],
     ) -> Result<Located, StepError> {
