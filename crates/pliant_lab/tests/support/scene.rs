@@ -146,6 +146,11 @@ impl World for Scene {
 
 /// Guest 0 grabs the tip as soon as possible and moves in a circle.
 pub fn circling() -> HandScript {
+    circling_with(GrabConfig::default())
+}
+
+/// The same with a spring and damper of the hand's own.
+pub fn circling_with(hold: GrabConfig) -> HandScript {
     let mut grab = None;
     Box::new(move |now, guest, session| {
         if guest != 0 || session.user().is_none() {
@@ -154,7 +159,7 @@ pub fn circling() -> HandScript {
         let t = now.as_secs_f64();
         let target = [1.0, 0.08 + 0.1 * (1.3 * t).sin(), 0.08 + 0.1 * (1.0 - (1.3 * t).cos())];
         match grab {
-            None => grab = session.begin_grab(now, BODY, 66, 0.05, target, GrabConfig::default()).ok(),
+            None => grab = session.begin_grab(now, BODY, 66, 0.05, target, hold).ok(),
             Some(g) => {
                 let _ = session.set_target(g, target);
             }
