@@ -393,6 +393,7 @@ fn cost_of_a_tick() {
                     radius: hand.radius,
                     target: truth.target(*id).unwrap(),
                     reaction: truth.reaction(*id).unwrap(),
+                    hold: GrabConfig::default(),
                 })
                 .collect();
             let (q, v, a) = (truth.q(), truth.v(), truth.a());

@@ -115,6 +115,7 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
             radius: 0.05,
             target: truth.target(hand).unwrap(),
             reaction: truth.reaction(hand).unwrap(),
+            hold: GrabConfig::default(),
         }];
         let (q, v, a, z) = (truth.q(), truth.v(), truth.a(), truth.z());
         let state = TickState { tick, q, v, a, z, pose: None, grabs: &grabs, resting: false };

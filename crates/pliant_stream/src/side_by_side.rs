@@ -200,6 +200,7 @@ fn observed(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide
                     radius: case.radius,
                     target: body.target(*id).unwrap(),
                     reaction: body.reaction(*id).unwrap(),
+                    hold: case.config,
                 },
                 displacement: copy.displacement(body.q(), case.vertex, case.radius),
                 held: true,

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 pub use pliant_modal::State;
-use pliant_modal::{Body, Frame, ModalModel};
+use pliant_modal::{Body, Frame, GrabConfig, ModalModel};
 
 /// Number of a step of the host. Ticks ascend by one per step of `h` seconds.
 pub type Tick = u64;
@@ -253,13 +253,19 @@ pub struct GrabState {
     pub target: [f64; 3],
     /// Force that the body exerts on the hand, world, N.
     pub reaction: [f64; 3],
+    /// The hand's own spring and damper. Over a network they are limited to what devices have
+    /// ([`GrabConfig::capped`]). Default: none.
+    pub hold: GrabConfig,
 }
 
 impl GrabState {
-    /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the radius is not
-    /// negative.
+    /// True when every number is finite and within [`MAGNITUDE_LIMIT`], the radius is not negative,
+    /// and spring and damper are in their ranges.
     pub fn is_valid(&self) -> bool {
-        in_range(&self.target) && in_range(&self.reaction) && (0.0..=MAGNITUDE_LIMIT).contains(&self.radius)
+        in_range(&self.target)
+            && in_range(&self.reaction)
+            && (0.0..=MAGNITUDE_LIMIT).contains(&self.radius)
+            && self.hold.check().is_ok()
     }
 }
 

@@ -55,6 +55,7 @@ fn visual(
                 radius: 0.05,
                 target: body.target(grab).unwrap(),
                 reaction: body.reaction(grab).unwrap(),
+                hold: GrabConfig::default(),
             }];
             truth.insert(tick, body.q().to_vec());
             let (q, v, a) = (body.q(), body.v(), body.a());

@@ -4,6 +4,7 @@
 
 mod support;
 
+use pliant_modal::GrabConfig;
 use pliant_stream::codec::encoder::Encoder;
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::History;
@@ -22,6 +23,7 @@ fn hands(count: u16) -> Vec<GrabState> {
         radius: 0.05,
         target: [1.0, 0.1 * f64::from(k), 0.3],
         reaction: [0.5, f64::from(k), -2.0],
+        hold: GrabConfig { stiffness: Some(200.0), relaxation: 0.0625 },
     };
     (0..count).map(hand).collect()
 }

@@ -289,6 +289,7 @@ impl World for Run {
                     radius: held.hand.radius,
                     target: self.body.target(id).ok()?,
                     reaction: self.body.reaction(id).ok()?,
+                    hold: GrabConfig::default(),
                 })
             })
             .collect();

@@ -22,7 +22,7 @@ pub type HandScript = Box<dyn FnMut(Duration, usize, &mut GuestSession)>;
 /// A host with one body that its guests may grab. The scene keeps every event.
 pub struct Scene {
     pub body: Body,
-    pub grabs: Vec<(GrabKey, GrabId, u32, f64)>,
+    pub grabs: Vec<(GrabKey, GrabId, u32, f64, GrabConfig)>,
     pub truth: Vec<(u64, Vec<f64>)>,
     pub host_events: Vec<HostEvent>,
     pub guest_events: Vec<(usize, GuestEvent)>,
@@ -87,12 +87,13 @@ impl World for Scene {
         let grabs: Vec<GrabState> = self
             .grabs
             .iter()
-            .map(|(key, id, vertex, radius)| GrabState {
+            .map(|(key, id, vertex, radius, hold)| GrabState {
                 key: *key,
                 vertex: *vertex,
                 radius: *radius,
                 target: self.body.target(*id).unwrap(),
                 reaction: self.body.reaction(*id).unwrap(),
+                hold: *hold,
             })
             .collect();
         self.reactions.extend(grabs.iter().map(|g| (tick, g.key, g.reaction)));
@@ -110,7 +111,7 @@ impl World for Scene {
                 let patch = Patch::around(self.body.model().surface(), *vertex, *radius).unwrap();
                 let id = self.body.grab(&patch, *hold).unwrap();
                 self.body.set_target(id, *target).unwrap();
-                self.grabs.push((*key, id, *vertex, *radius));
+                self.grabs.push((*key, id, *vertex, *radius, *hold));
             }
             HostEvent::GrabMoved { key, target, .. } => {
                 if let Some(g) = self.grabs.iter().find(|g| g.0 == *key) {

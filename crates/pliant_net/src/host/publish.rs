@@ -12,6 +12,7 @@ use pliant_stream::{BodyId, GrabKey, GrabState, RigidState, StepSettings, TickSt
 
 use super::NetHost;
 use super::hands::GuestGrab;
+use crate::patch_kinematics::hold_of;
 use crate::session_transform::{SessionTransform, placement_of};
 use crate::shared_body::SharedBody;
 use crate::user::{User, UserLink};
@@ -90,6 +91,7 @@ pub(crate) fn publish(
                 radius: grab.radius,
                 target: place.point_to_session(grab.target),
                 reaction: place.force_to_session(force.force),
+                hold: hold_of(grab),
             };
             if grab.is_valid() && streamed.len() < pliant_stream::MAX_GRABS {
                 streamed.push(grab);

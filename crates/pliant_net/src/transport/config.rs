@@ -16,7 +16,7 @@ use pliant_stream::{DisconnectReason, Role};
 
 /// The application protocol and its version. The handshake negotiates it and refuses another
 /// version.
-pub const ALPN: &[u8] = b"pliant/4";
+pub const ALPN: &[u8] = b"pliant/5";
 
 /// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -288,6 +288,7 @@ impl Encoder {
                     radius,
                     target: g.target.map(|x| f64::from(x as f32)),
                     reaction: g.reaction.map(round24),
+                    hold: g.hold.capped(),
                     ..*g
                 };
                 FrameGrab { state, displacement: displacement.map(round24), held: true }
@@ -367,9 +368,10 @@ impl Encoder {
         // 5 bytes: the header of 3 bytes, and the part number and count that are not in any frame
         // yet.
         let fill = |into: &mut TickFrame, rest: &mut std::vec::IntoIter<FrameGrab>| {
-            while 5 + into.bytes() + TickFrame::grab_bytes(into.displacements) <= room {
-                let Some(g) = rest.next() else { return };
-                into.grabs.push(g);
+            while let Some(g) = rest.as_slice().first()
+                && 5 + into.bytes() + into.grab_bytes(g) <= room
+            {
+                into.grabs.extend(rest.next());
             }
         };
         fill(frame, &mut rest);

@@ -354,6 +354,7 @@ impl PeerBody {
                 radius: g.radius,
                 target: g.target,
                 reaction: (-pull).into(),
+                hold: g.hold,
             });
         }
     }

@@ -357,16 +357,19 @@ impl PredictedHand {
     fn one_step(&mut self, copy: &mut BodyCopy, receiver: &Receiver, user: UserId, j: usize) {
         let history = receiver.history();
         let tick = receiver.tick() + j as u64;
-        let free = self.replica.model().is_free();
+        let (free, h) = (self.replica.model().is_free(), self.replica.kernel().h());
         self.replica.release_all();
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
-            let Some(g) = history.grab(g.key, tick, &self.forecast) else { continue };
-            let held = self.replica.hold_measured(copy, &g);
+            let at = |tick| history.grab(g.key, tick, &self.forecast);
+            let Some(now) = at(tick) else { continue };
+            let held = self.replica.hold_measured(copy, &now);
             if let (true, Some(hand)) = (free, held) {
                 // The frame moves on from the confirmed one. The remote hand is therefore held at
-                // its extrapolated target, not where the patch was.
-                let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
-                hand.hold = Hold::Target { target: g.state.target.into(), velocity, config };
+                // its extrapolated target, by its own spring and damper, not where the patch was.
+                let target = Vector3::from(now.state.target);
+                let way = at(tick - 1).map(|before| target - Vector3::from(before.state.target));
+                let velocity = way.map_or_else(Vector3::zeros, |way| way / h);
+                hand.hold = Hold::Target { target, velocity, config: now.state.hold };
             }
         }
         for g in &self.grabs {

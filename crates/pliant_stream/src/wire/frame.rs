@@ -1,8 +1,11 @@
 //! A frame: one tick of one body. It is intra-coded, so it is decoded without any other frame.
 
+use pliant_modal::GrabConfig;
 use serde::{Deserialize, Serialize};
 
 use super::bits::{BitReader, BitWriter, WIDTH_BITS, whole, width};
+use super::datagram::bounded;
+use super::hold::{decode_hold, encode_hold, hold_bytes, hold_parts};
 use super::{Reader, Slice, Writer};
 use crate::StreamError;
 use crate::codec::quantization::Quanta;
@@ -17,7 +20,7 @@ const RESENT: u8 = 32;
 const DISPLACEMENTS: u8 = 64;
 const PART: u8 = 128;
 
-/// Bytes of one grab in a frame.
+/// Bytes of one grab in a frame, without spring, damper and displacement.
 const GRAB_BYTES: usize = 34;
 /// Largest number of datagrams for one tick of a body.
 pub(crate) const MAX_PARTS: u8 = 16;
@@ -274,8 +277,8 @@ pub struct TickFrame {
 
 impl TickFrame {
     /// Bytes of one grab.
-    pub(crate) fn grab_bytes(displacements: bool) -> usize {
-        GRAB_BYTES + if displacements { 9 } else { 0 }
+    pub(crate) fn grab_bytes(&self, g: &FrameGrab) -> usize {
+        GRAB_BYTES + if self.displacements { 9 } else { 0 } + hold_bytes(&g.state.hold)
     }
 
     /// Bytes of this frame in a datagram, without the 3 bytes of header.
@@ -284,7 +287,7 @@ impl TickFrame {
         let repeat = |r: &Repeat| {
             3 + (10 + more) * r.grabs.len() + r.accelerations.as_ref().map_or(0, Accelerations::bytes)
         };
-        12 + (GRAB_BYTES + more) * self.grabs.len()
+        12 + self.grabs.iter().map(|g| self.grab_bytes(g)).sum::<usize>()
             + if self.pose.is_some() { 46 } else { 0 }
             + self.accelerations.as_ref().map_or(0, Accelerations::bytes)
             + if self.part.is_some() { 2 } else { 0 }
@@ -317,7 +320,7 @@ impl TickFrame {
         for g in grabs {
             w.u16(g.state.key.user.0);
             w.u16(g.state.key.grab);
-            w.u8(u8::from(g.held));
+            w.u8(u8::from(g.held) | hold_parts(&g.state.hold) << 1);
             w.u32(g.state.vertex);
             w.f32(g.state.radius as f32);
             w.vector(g.state.target);
@@ -325,6 +328,7 @@ impl TickFrame {
             if self.displacements {
                 w.vector24(g.displacement);
             }
+            encode_hold(&g.state.hold, w);
         }
         if let Some(p) = &self.pose {
             w.vector(p.position);
@@ -387,18 +391,22 @@ impl TickFrame {
         let mut grabs = Vec::with_capacity(count.min(r.left() / GRAB_BYTES));
         for _ in 0..count {
             let key = GrabKey { user: UserId(r.u16("grab user")?), grab: r.u16("grab")? };
-            let held = r.u8("grab held")? != 0;
-            let state = GrabState {
+            let parts = r.u8("grab parts")?;
+            bounded("grab parts", parts, 7, "0 to 7")?;
+            let mut state = GrabState {
                 key,
                 vertex: r.u32("grab vertex")?,
                 radius: r.f32("grab radius")?,
                 target: r.vector("grab target")?,
                 reaction: r.vector24("grab reaction")?,
+                hold: GrabConfig::default(),
             };
             if state.radius < 0.0 {
                 return invalid("grab radius", state.radius.to_string(), "0 m or more");
             }
-            grabs.push(FrameGrab { state, displacement: displacement(r)?, held });
+            let displacement = displacement(r)?;
+            state.hold = decode_hold(parts >> 1, r)?;
+            grabs.push(FrameGrab { state, displacement, held: parts & 1 != 0 });
         }
         let pose = if flags & POSE == 0 { None } else { Some(decode_pose(r)?) };
         let accelerations = if flags & ACCELERATIONS == 0 { None } else { Some(Accelerations::decode(r)?) };

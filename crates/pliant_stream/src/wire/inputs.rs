@@ -3,7 +3,7 @@
 use pliant_modal::GrabConfig;
 
 use super::datagram::bounded;
-use super::message::check_hold;
+use super::hold::{decode_hold, encode_hold, hold_bytes, hold_parts};
 use super::{Reader, Writer};
 use crate::StreamError;
 use crate::state::{BodyId, GrabKey, Tick, UserId};
@@ -14,8 +14,6 @@ pub(crate) const MAX_TICKS: usize = 16;
 pub(crate) const MAX_HELD: usize = 16;
 /// Bytes of one grab without spring and damper.
 const HELD_BYTES: usize = 25;
-/// Bytes of the spring of a grab, and of its damper, if present.
-const HOLD_BYTES: usize = 4;
 
 /// A grab at one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,8 +47,7 @@ impl HeldAt {
     }
 
     fn bytes(&self) -> usize {
-        let parts = usize::from(self.hold.stiffness.is_some()) + usize::from(self.hold.relaxation != 0.0);
-        HELD_BYTES + parts * HOLD_BYTES
+        HELD_BYTES + hold_bytes(&self.hold)
     }
 
     fn encode(&self, w: &mut Writer) {
@@ -59,14 +56,8 @@ impl HeldAt {
         w.u32(self.vertex);
         w.f32(self.radius as f32);
         w.vector(self.target);
-        let damper = self.hold.relaxation != 0.0;
-        w.u8(u8::from(self.hold.stiffness.is_some()) | u8::from(damper) << 1);
-        if let Some(stiffness) = self.hold.stiffness {
-            w.f32(stiffness as f32);
-        }
-        if damper {
-            w.f32(self.hold.relaxation as f32);
-        }
+        w.u8(hold_parts(&self.hold));
+        encode_hold(&self.hold, w);
     }
 
     fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
@@ -80,13 +71,7 @@ impl HeldAt {
         };
         let has = r.u8("held hand")?;
         bounded("held hand", has, 3, "0 to 3")?;
-        if has & 1 != 0 {
-            held.hold.stiffness = Some(r.f32("held stiffness")?);
-        }
-        if has & 2 != 0 {
-            held.hold.relaxation = r.f32("held relaxation")?;
-        }
-        held.hold = check_hold(held.hold)?;
+        held.hold = decode_hold(has, r)?;
         if held.radius < 0.0 {
             let found = held.radius.to_string();
             return Err(StreamError::Invalid { what: "held radius", found, expected: "0 m or more" });

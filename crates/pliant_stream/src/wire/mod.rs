@@ -9,6 +9,7 @@ mod bits;
 mod bytes;
 mod datagram;
 mod frame;
+mod hold;
 mod inputs;
 mod message;
 mod peer_message;
@@ -28,4 +29,4 @@ pub use peer_message::{PeerBodyState, PeerFrame, PeerHandState, PeerMessage};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.
-pub const PROTOCOL_VERSION: u16 = 4;
+pub const PROTOCOL_VERSION: u16 = 5;

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use pliant_modal::GrabConfig;
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
 use pliant_stream::wire::FrameGrab;
 use pliant_stream::{
@@ -21,6 +22,10 @@ pub fn grab(index: u16) -> FrameGrab {
             radius: 0.25,
             target: [1.0, 2.0, 3.0],
             reaction: [0.5, -8.0, 1024.0],
+            hold: GrabConfig {
+                stiffness: (index == 1).then_some(200.0),
+                relaxation: if index == 2 { 0.0625 } else { 0.0 },
+            },
         },
         displacement: [0.25, 0.0, -0.5],
         held: index != 2,
