@@ -6,10 +6,10 @@ mod rig;
 
 use std::sync::Arc;
 
-use pliant_haptics::{Coupling, CouplingConfig, HandModel, VirtualConfig};
+use pliant_haptics::{Coupling, CouplingConfig, HandModel, LoopEvent, VirtualConfig};
 use rig::{
     baked,
-    scene::{Drag, SceneConfig, Subject, drag},
+    scene::{Drag, Scene, SceneConfig, Subject, drag},
 };
 
 fn holds(config: SceneConfig) -> Drag {
@@ -53,6 +53,50 @@ fn dragging_near_is_calm() {
                 holds(SceneConfig { young, simulation, hand, modes: 12, ..SceneConfig::default() });
             }
         }
+    }
+}
+
+/// The motors work on a hand that lowers a weight, and what they give is what lifting took. It is
+/// no energy of the controller's own, so passivity must not cut the force.
+#[test]
+fn a_free_body_weighs_as_much_when_it_is_lowered() {
+    const WEIGHT: f64 = 1.0;
+    const WAY: f64 = 0.04;
+    for modal in [false, true] {
+        let subject = Subject::Baked(Arc::new(baked::jack()));
+        let hand = HandModel::FIRM;
+        let mut scene = Scene::new(SceneConfig {
+            subject,
+            hand,
+            modes: 12,
+            weight: WEIGHT,
+            modal,
+            ..SceneConfig::default()
+        });
+        scene.run(3.0);
+        let (mut lowest, mut largest) = (f64::INFINITY, 0.0f64);
+        for round in 0..5 {
+            for (from, to) in [(0.0, WAY), (WAY, 0.0)] {
+                let mut sum = 0.0;
+                for k in 1..=2000 {
+                    let s = f64::from(k) / 2000.0;
+                    scene.hand.set_target([0.0, from + (to - from) * s * s * (3.0 - 2.0 * s), 0.0]);
+                    scene.tick();
+                    sum -= scene.cycle.core().last().wrench.force[1];
+                }
+                let mean = sum / 2000.0;
+                (lowest, largest) = (lowest.min(mean), largest.max(mean));
+                // A hand that lifts and lowers slowly carries the weight, whichever way it moves. The
+                // difference is the damper's.
+                assert!((mean - WEIGHT).abs() < 0.15 * WEIGHT, "round {round}, to {to} m: {mean} N");
+            }
+        }
+        println!(
+            "modal {modal}: {lowest:.3} to {largest:.3} of {WEIGHT} N, given {:.2} mJ",
+            1e3 * scene.most_given
+        );
+        assert!(scene.most_given <= 5e-3, "{} J beyond what was put in", scene.most_given);
+        assert!(!scene.events.iter().any(|e| matches!(e, LoopEvent::Fault(_))), "{:?}", scene.events);
     }
 }
 

@@ -5,10 +5,18 @@ use std::path::Path;
 
 use pliant_modal::{FlexibilitySite, ModalModel, ModelParts, SurfaceMesh};
 
-/// Reads the body that the project ships.
+/// Reads the anchored body that the project ships.
 pub fn pip() -> ModalModel {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
-    ModalModel::read(path).unwrap()
+    asset("pip.modal")
+}
+
+/// Reads the free body that the project ships.
+pub fn jack() -> ModalModel {
+    asset("jack.modal")
+}
+
+fn asset(name: &str) -> ModalModel {
+    ModalModel::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets").join(name)).unwrap()
 }
 
 /// Returns `model` with Young's modulus `young` (Pa) and the largest extent `size` (m). Density,

@@ -7,7 +7,7 @@ use pliant_haptics::{
     Cycle, HandModel, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap,
     VirtualConfig, VirtualDevice, VirtualHandle, VirtualScheduler,
 };
-use pliant_modal::{Body, BodyConfig, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, ModalModel, Patch, StepSettings};
 
 use super::{
     baked::{made_of, top},
@@ -57,6 +57,8 @@ pub struct SceneConfig {
     pub simulation: f64,
     pub round_trip: f64,
     pub modal: bool,
+    /// Gravity that gives the body this weight, N, along -y.
+    pub weight: f64,
 }
 
 impl Default for SceneConfig {
@@ -71,6 +73,7 @@ impl Default for SceneConfig {
             simulation: 120.0,
             round_trip: 0.0,
             modal: false,
+            weight: 0.0,
         }
     }
 }
@@ -84,7 +87,10 @@ impl Scene {
         let model = Arc::new(model);
         let step = 1.0 / c.simulation;
         let modes = Some(c.modes.min(model.mode_count()));
-        let mut body = Body::new(model.clone(), BodyConfig { step, modes, ..BodyConfig::default() }).unwrap();
+        let gravity = [0.0, -c.weight / model.mass(), 0.0];
+        let settings = StepSettings { gravity, ..StepSettings::default() };
+        let config = BodyConfig { step, modes, settings, ..BodyConfig::default() };
+        let mut body = Body::new(model.clone(), config).unwrap();
         let device = VirtualDevice::new(c.device, c.hand).unwrap();
         let hand = device.handle();
         let patch = Patch::around(model.surface(), vertex, radius).unwrap();
