@@ -43,9 +43,38 @@ fn reactions(model: &Arc<ModalModel>, hz: f64, second_order: bool) -> Vec<f64> {
         .collect()
 }
 
+/// Integrates `modes` coordinates and their velocities from rest by the Runge-Kutta method in steps
+/// of 1/`fine` s. Samples the coordinates at multiples of 1/`hz` s.
+fn integrate<T>(
+    modes: usize,
+    [hz, fine]: [f64; 2],
+    slope: impl Fn(&[f64], f64) -> Vec<f64>,
+    sample: impl Fn(&[f64], f64) -> T,
+) -> Vec<T> {
+    let add =
+        |s: &[f64], k: &[f64], h: f64| -> Vec<f64> { s.iter().zip(k).map(|(s, k)| s + h * k).collect() };
+    let (h, every) = (1.0 / fine, (fine / hz) as usize);
+    let mut state = vec![0.0; 2 * modes];
+    let mut out = Vec::new();
+    for step in 0..(WATCHED * fine) as usize {
+        let t = step as f64 * h;
+        let k1 = slope(&state, t);
+        let k2 = slope(&add(&state, &k1, 0.5 * h), t + 0.5 * h);
+        let k3 = slope(&add(&state, &k2, 0.5 * h), t + 0.5 * h);
+        let k4 = slope(&add(&state, &k3, h), t + h);
+        for (i, s) in state.iter_mut().enumerate() {
+            *s += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
+        }
+        if (step + 1) % every == 0 {
+            out.push(sample(&state[..modes], t + h));
+        }
+    }
+    out
+}
+
 /// Returns the same reaction from `q'' + c q' + omega^2 q = phi (target - phi . q) / C`.
 ///
-/// It uses the Runge-Kutta method in steps of 1/`fine` s and samples at multiples of 1/`hz` s.
+/// See [`integrate`] for `hz` and `fine`.
 fn exact(model: &Arc<ModalModel>, hz: f64, fine: f64) -> Vec<f64> {
     let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
     let patch = patch(model);
@@ -66,25 +95,7 @@ fn exact(model: &Arc<ModalModel>, hz: f64, fine: f64) -> Vec<f64> {
             (0..MODES).map(|k| phi[k] * pull - model.damping()[k] * v[k] - model.omega()[k].powi(2) * q[k]);
         v.iter().copied().chain(a).collect()
     };
-    let add =
-        |s: &[f64], k: &[f64], h: f64| -> Vec<f64> { s.iter().zip(k).map(|(s, k)| s + h * k).collect() };
-    let (h, every) = (1.0 / fine, (fine / hz) as usize);
-    let mut state = vec![0.0; 2 * MODES];
-    let mut out = Vec::new();
-    for step in 0..(WATCHED * fine) as usize {
-        let t = step as f64 * h;
-        let k1 = slope(&state, t);
-        let k2 = slope(&add(&state, &k1, 0.5 * h), t + 0.5 * h);
-        let k3 = slope(&add(&state, &k2, 0.5 * h), t + 0.5 * h);
-        let k4 = slope(&add(&state, &k3, h), t + h);
-        for (i, s) in state.iter_mut().enumerate() {
-            *s += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
-        }
-        if (step + 1) % every == 0 {
-            out.push(-pull(&state[..MODES], t + h));
-        }
-    }
-    out
+    integrate(MODES, [hz, fine], slope, |q, t| -pull(q, t))
 }
 
 /// Returns the largest and the root mean square difference, as shares of the largest force.
@@ -98,7 +109,8 @@ fn error(reactions: &[f64], exact: &[f64]) -> (f64, f64) {
 fn what_a_hand_feels_is_of_second_order() {
     let model = Arc::new(rod(2e5, MODES, 0.05, false));
     let of = |hz: f64, second| error(&reactions(&model, hz, second), &exact(&model, hz, 192_000.0));
-    for hz in [60.0, 120.0, 240.0, 480.0] {
+    // The largest errors of the second order, as shares of the largest force.
+    for (hz, most) in [(60.0, 3e-3), (120.0, 7.5e-4), (240.0, 2e-4), (480.0, 6e-5)] {
         let (first, second) = (of(hz, false), of(hz, true));
         println!(
             "{hz} Hz: first order {:.2} % (rms {:.2} %), second {:.3} % (rms {:.3} %)",
@@ -107,12 +119,12 @@ fn what_a_hand_feels_is_of_second_order() {
             100.0 * second.0,
             100.0 * second.1
         );
+        assert!(second.0 < most && second.0 < 0.1 * first.0, "{hz} Hz: {first:?}, {second:?}");
     }
     let errors: Vec<f64> = [120.0, 240.0, 480.0].map(|hz| of(hz, true).1).to_vec();
     for pair in errors.windows(2) {
         assert!(pair[0] / pair[1] > 3.3, "half the step, a quarter of the error: {errors:?}");
     }
-    assert!(of(60.0, true).1 < 0.3 * of(60.0, false).1);
 }
 
 /// The hand's own spring, N/m. With a stiffer one the fastest modes under the hand are still too
@@ -198,25 +210,7 @@ impl Bent {
             });
             v.iter().copied().chain(a).collect()
         };
-        let add =
-            |s: &[f64], k: &[f64], h: f64| -> Vec<f64> { s.iter().zip(k).map(|(s, k)| s + h * k).collect() };
-        let (h, every) = (1.0 / fine, (fine / hz) as usize);
-        let mut state = vec![0.0; 2 * modes];
-        let mut out = Vec::new();
-        for step in 0..(WATCHED * fine) as usize {
-            let t = step as f64 * h;
-            let k1 = slope(&state, t);
-            let k2 = slope(&add(&state, &k1, 0.5 * h), t + 0.5 * h);
-            let k3 = slope(&add(&state, &k2, 0.5 * h), t + 0.5 * h);
-            let k4 = slope(&add(&state, &k3, h), t + h);
-            for (i, s) in state.iter_mut().enumerate() {
-                *s += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
-            }
-            if (step + 1) % every == 0 {
-                out.push((-pull(&state[..modes], t + h)).into());
-            }
-        }
-        out
+        integrate(modes, [hz, fine], slope, |q, t| (-pull(q, t)).into())
     }
 }
 
@@ -236,7 +230,7 @@ fn what_a_hand_feels_of_a_bent_body_comes_nearer_with_the_step() {
         rms
     });
     // The force of the middle of a step acts on the shape at its end, which is of first order.
-    assert!(errors[0] < 1.2e-3, "{errors:?}");
+    assert!(errors[0] < 1.1e-3 && errors[1] < 5.5e-4 && errors[2] < 2.7e-4, "{errors:?}");
     for pair in errors.windows(2) {
         assert!(pair[0] / pair[1] > 1.8, "half the step, half of the error: {errors:?}");
     }
