@@ -54,8 +54,7 @@ fn samples() -> Vec<Datagram> {
         pose: (payload == 2).then(|| RigidState { position: [1.0, 2.0, 3.0], ..RigidState::default() }),
         accelerations: match payload {
             1 => Some(quantized(AccelerationCoding::Visible, &[1.0, -2.0, 0.25])),
-            2 => Some(quantized(AccelerationCoding::F32, &[1.0, -2.0, 0.25])),
-            3 => Some(quantized(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
+            2 => Some(quantized(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
             _ => None,
         },
         slice: (payload != 1).then(|| sliced(payload)),

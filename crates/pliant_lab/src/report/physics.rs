@@ -297,7 +297,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
         ("generalized-alpha 0.5", alpha),
     ];
     let rates: &[f64] =
-        if quick { &[60.0, 240.0, 960.0] } else { &[60.0, 120.0, 240.0, 480.0, 960.0, 1920.0] };
+        if quick { &[60.0, 120.0, 240.0, 960.0] } else { &[60.0, 120.0, 240.0, 480.0, 960.0, 1920.0] };
     let at = |rate: f64, integrator| BodyConfig {
         step: 1.0 / rate,
         settings: StepSettings { integrator, ..Default::default() },

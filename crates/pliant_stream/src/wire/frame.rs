@@ -33,8 +33,6 @@ pub enum AccelerationCoding {
     /// Quantization steps of equal displacement on the surface, in as many bits as the modes need,
     /// in a closed loop; see [`Quanta`]. This is the default.
     Visible,
-    /// 4 bytes per mode.
-    F32,
     /// 8 bytes per mode without rounding, for measurements.
     F64,
 }
@@ -44,7 +42,6 @@ impl AccelerationCoding {
     pub fn bytes_per_mode(self) -> usize {
         match self {
             Self::Visible => 1,
-            Self::F32 => 4,
             Self::F64 => 8,
         }
     }
@@ -63,9 +60,7 @@ pub enum Accelerations {
         /// Quantization steps, one per mode.
         steps: Vec<i32>,
     },
-    /// Unquantized values in single precision.
-    F32(Vec<f32>),
-    /// Unquantized values in double precision.
+    /// Unquantized values.
     F64(Vec<f64>),
 }
 
@@ -79,7 +74,6 @@ impl Accelerations {
                     |(x, p): (&f64, &f64)| if unit > 0.0 { whole(x / (p * f64::from(unit))) } else { 0 };
                 Self::Visible { unit, steps: values.iter().zip(&quanta.acceleration).map(step).collect() }
             }
-            AccelerationCoding::F32 => Self::F32(values.iter().map(|&x| x as f32).collect()),
             AccelerationCoding::F64 => Self::F64(values.to_vec()),
         }
     }
@@ -88,7 +82,6 @@ impl Accelerations {
     pub fn modes(&self) -> usize {
         match self {
             Self::Visible { steps, .. } => steps.len(),
-            Self::F32(x) => x.len(),
             Self::F64(x) => x.len(),
         }
     }
@@ -100,7 +93,6 @@ impl Accelerations {
                 (Some(step), Some(quantum)) => f64::from(*unit) * quantum * f64::from(*step),
                 _ => 0.0,
             },
-            Self::F32(x) => f64::from(x.get(mode).copied().unwrap_or(0.0)),
             Self::F64(x) => x.get(mode).copied().unwrap_or(0.0),
         }
     }
@@ -119,13 +111,8 @@ impl Accelerations {
                 }
                 bits.finish();
             }
-            Self::F32(x) => {
-                w.u8(1);
-                w.u16(x.len() as u16);
-                x.iter().for_each(|&x| w.f32(x));
-            }
             Self::F64(x) => {
-                w.u8(2);
+                w.u8(1);
                 w.u16(x.len() as u16);
                 x.iter().for_each(|&x| w.f64(x));
             }
@@ -138,7 +125,6 @@ impl Accelerations {
                 let bits = |block: &[i32]| WIDTH_BITS + block_width(block) * block.len() as u32;
                 7 + steps.chunks(BLOCK).map(bits).sum::<u32>().div_ceil(8) as usize
             }
-            Self::F32(x) => 3 + 4 * x.len(),
             Self::F64(x) => 3 + 8 * x.len(),
         }
     }
@@ -179,13 +165,6 @@ impl Accelerations {
                 Ok(Self::Visible { unit, steps })
             }
             1 => {
-                let mut x = Vec::with_capacity(fits(4 * count)?);
-                for _ in 0..count {
-                    x.push(r.wide32("acceleration")?);
-                }
-                Ok(Self::F32(x))
-            }
-            2 => {
                 let mut x = Vec::with_capacity(fits(8 * count)?);
                 for _ in 0..count {
                     x.push(r.wide("acceleration")?);
@@ -195,7 +174,7 @@ impl Accelerations {
             other => Err(StreamError::Invalid {
                 what: "acceleration coding",
                 found: other.to_string(),
-                expected: "0..=2",
+                expected: "0 or 1",
             }),
         }
     }
