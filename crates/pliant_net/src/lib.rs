@@ -57,6 +57,7 @@ mod guest;
 mod host;
 mod known_users;
 mod metrics;
+mod own_grab;
 mod patch_kinematics;
 mod peer;
 mod phase;

@@ -1,8 +1,7 @@
 //! Patch kinematics: the position of a held patch on a shape that another app steps.
 
 use bevy::math::DVec3;
-use pliant_body::Grab;
-use pliant_modal::{GrabConfig, ModalModel, ModelError, Patch, warp};
+use pliant_modal::{ModalModel, ModelError, Patch, warp};
 
 use crate::view::Held;
 
@@ -62,16 +61,4 @@ impl PatchPoint {
         let bent = warp(sum(&self.rotation).into(), displacement.into());
         self.rest + DVec3::from(bent)
     }
-}
-
-/// Returns the spring and damper parameters of a grab.
-pub(crate) fn hold_of(grab: &Grab) -> GrabConfig {
-    GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation }
-}
-
-/// Returns whether a grab still has the parameters `hold`. The comparison is by bits, so that a NaN
-/// value is sent, and refused, only once.
-pub(crate) fn holds_so(grab: &Grab, hold: &GrabConfig) -> bool {
-    let bits = |hold: &GrabConfig| (hold.stiffness.map(f64::to_bits), hold.relaxation.to_bits());
-    bits(&hold_of(grab)) == bits(hold)
 }

@@ -122,7 +122,7 @@ impl NetGuest {
     pub(super) fn body_gone(&mut self, world: &mut World, id: BodyId) {
         self.less_since.remove(&id);
         let Some(followed) = self.bodies.remove(&id) else { return };
-        self.grabs.retain(|_, sent| sent.body != id);
+        self.grabs.retain(|_, sent| sent.own.body != id);
         Self::take_leave(world, followed);
     }
 

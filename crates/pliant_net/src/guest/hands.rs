@@ -5,20 +5,16 @@ use std::time::Duration;
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabOf};
-use pliant_modal::GrabConfig;
 use pliant_stream::BodyId;
 
 use super::NetGuest;
-use crate::patch_kinematics::{PatchPoint, hold_of, holds_so};
+use crate::own_grab::OwnGrab;
 use crate::remote::RemoteBody;
 use crate::session_transform::SessionTransform;
 
-/// A local grab as it was sent to the host.
+/// A local grab and what of it was sent to the host.
 pub(super) struct SentGrab {
-    pub(super) body: BodyId,
-    vertex: u32,
-    radius: f64,
-    hold: GrabConfig,
+    pub(super) own: OwnGrab,
     /// The target that was last sent, in session coordinates, and for how many ticks it has been
     /// sent.
     target: [f64; 3],
@@ -26,9 +22,6 @@ pub(super) struct SentGrab {
     path: HandPath,
     /// The body's tick when the target was sent.
     tick: u64,
-    /// The session's number of the grab. `None`: refused.
-    pub(super) number: Option<u16>,
-    pub(super) point: Option<PatchPoint>,
 }
 
 /// `PostUpdate`: sends the app's own grabs on the session's bodies to the host.
@@ -42,11 +35,10 @@ pub(crate) fn send_hands(
     let now = guest.now();
     let Some(session) = guest.session.as_mut().filter(|session| session.user().is_some()) else { return };
     guest.grabs.retain(|&entity, sent| {
-        let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == sent.vertex && grab.radius == sent.radius && holds_so(grab, &sent.hold);
-            same && bodies.get(of.0).is_ok_and(|(body, ..)| body.0 == sent.body)
-        });
-        if let (false, Some(number)) = (stays, sent.number) {
+        let stays = grabs
+            .get(entity)
+            .is_ok_and(|(_, grab, of)| sent.own.is(grab, bodies.get(of.0).ok().map(|(body, ..)| body.0)));
+        if let (false, Some(number)) = (stays, sent.own.number) {
             session.end_grab(number);
         }
         stays
@@ -57,25 +49,11 @@ pub(crate) fn send_hands(
         let target = place.point_to_session(grab.target);
         match guest.grabs.get_mut(&entity) {
             None => {
-                let hold = hold_of(grab);
-                let begun = session.begin_grab(now, body.0, grab.vertex, grab.radius, target, hold);
-                if let Err(error) = &begun {
-                    debug!("a grab was not sent: {error}");
-                }
-                let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
-                let sent = SentGrab {
-                    body: body.0,
-                    vertex: grab.vertex,
-                    radius: grab.radius,
-                    hold,
-                    target,
-                    times: 0,
-                    path: HandPath(VecDeque::from([(now, target)])),
-                    tick: 0,
-                    number: begun.ok(),
-                    point,
-                };
-                guest.grabs.insert(entity, sent);
+                let own = OwnGrab::begin(body.0, grab, state.model(), |hold| {
+                    session.begin_grab(now, body.0, grab.vertex, grab.radius, target, hold)
+                });
+                let path = HandPath(VecDeque::from([(now, target)]));
+                guest.grabs.insert(entity, SentGrab { own, target, times: 0, path, tick: 0 });
             }
             Some(sent) => sent.path.push(now, target),
         }
@@ -142,7 +120,7 @@ impl NetGuest {
         let frame = now.saturating_sub(from);
         let tick = Duration::from_secs_f64(session.step());
         let part = tick.div_f64(READS);
-        let moving = self.grabs.values().any(|sent| sent.number.is_some());
+        let moving = self.grabs.values().any(|sent| sent.own.number.is_some());
         let parts = if moving && frame.as_secs_f64() < LONGEST_FRAME {
             (frame.as_secs_f64() / part.as_secs_f64()).ceil().max(1.0) as u32
         } else {
@@ -153,8 +131,8 @@ impl NetGuest {
             let at = from + frame.mul_f64(share).min(frame);
             session.update(at);
             for sent in self.grabs.values_mut() {
-                let Some(number) = sent.number else { continue };
-                let Some(view) = session.body(sent.body) else { continue };
+                let Some(number) = sent.own.number else { continue };
+                let Some(view) = session.body(sent.own.body) else { continue };
                 // A body that rests or has stalled has no ticks. Its hands send once a frame, so
                 // that a hand can wake it.
                 let steps = !view.is_resting() && !view.is_stalled();
@@ -168,7 +146,7 @@ impl NetGuest {
                 match session.set_target(number, target) {
                     Ok(()) => {
                         (sent.target, sent.tick, sent.times) =
-                            (target, view_tick(session, sent.body), sent.times + 1)
+                            (target, view_tick(session, sent.own.body), sent.times + 1)
                     }
                     Err(error) => debug!("a target was not sent: {error}"),
                 }

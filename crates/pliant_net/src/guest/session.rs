@@ -238,9 +238,9 @@ impl NetGuest {
                     self.users.leave(world, user, reason);
                 }
                 GuestEvent::GrabRefused { grab } => {
-                    let refused = self.grabs.iter_mut().find(|(_, sent)| sent.number == Some(grab));
+                    let refused = self.grabs.iter_mut().find(|(_, sent)| sent.own.number == Some(grab));
                     if let Some((&entity, sent)) = refused {
-                        sent.number = None;
+                        sent.own.number = None;
                         world.write_message(GrabRefused { entity });
                     }
                 }

@@ -51,15 +51,11 @@ pub(crate) fn show(
         followed.display.write(at, state, &mut visual, &mut transform, &mut guest.scratch);
         let Some(place) = SessionTransform::of_body(global, state) else { continue };
         hands.set_if_neq(remote_hands(view.grabs(), user, &place));
-        for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.body == id) {
+        for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.own.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
-            let grab_force = sent.number.zip(user).and_then(|(grab, user)| {
-                let reaction = view.hand_reaction(user, grab)?;
-                let grab_force =
-                    followed.display.force(reaction, sent.point.as_ref()?, &place, state, &visual);
-                Some(GrabForce { force: grab_force.force.clamp_length_max(most_force), ..grab_force })
-            });
-            force.set_if_neq(grab_force.unwrap_or_default());
+            let reaction = sent.own.number.zip(user).and_then(|(grab, user)| view.hand_reaction(user, grab));
+            let at = (&place, state, &*visual);
+            sent.own.write_force(&mut force, reaction, most_force, &followed.display, at);
         }
     }
     shape_held(session, &guest.bodies, &bodies, &wanted, cache);

@@ -12,7 +12,7 @@ use pliant_stream::{BodyId, GrabKey, GrabState, RigidState, StepSettings, TickSt
 
 use super::NetHost;
 use super::hands::GuestGrab;
-use crate::patch_kinematics::hold_of;
+use crate::own_grab::hold_of;
 use crate::session_transform::{SessionTransform, placement_of};
 use crate::shared_body::SharedBody;
 use crate::user::{User, UserLink};

@@ -21,6 +21,7 @@ use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
 use crate::known_users::KnownUsers;
 use crate::metrics::{Ledger, NetStats};
+use crate::own_grab::OwnGrab;
 use crate::remote::SessionJoined;
 use crate::roster::Roster;
 use crate::shared_body::SharedBody;
@@ -30,7 +31,7 @@ use crate::transport::{
 };
 use crate::user::shortened;
 use mesh::ConnectedPeer;
-use play::{PeerGrab, PlayedBody};
+use play::PlayedBody;
 use reconnect::Missed;
 
 pub(crate) use mesh::receive;
@@ -123,7 +124,7 @@ pub struct NetPeer {
     /// Each peer has one of its own, so that none is known to all.
     tokens: BTreeMap<Fingerprint, Token>,
     users: Roster,
-    grabs: BTreeMap<Entity, PeerGrab>,
+    grabs: BTreeMap<Entity, OwnGrab>,
     scratch: Vec<f64>,
     ledger: Ledger,
     next_opened: u64,

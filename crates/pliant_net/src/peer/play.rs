@@ -5,11 +5,11 @@ use std::sync::Arc;
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf};
-use pliant_modal::{Body, GrabConfig, ModalModel};
-use pliant_stream::{BodyId, GrabKey, StepSettings};
+use pliant_modal::{Body, ModalModel};
+use pliant_stream::{GrabKey, StepSettings};
 
 use super::{NetPeer, PeerState};
-use crate::patch_kinematics::{PatchPoint, hold_of, holds_so};
+use crate::own_grab::OwnGrab;
 use crate::session_transform::SessionTransform;
 use crate::view::{BodyDisplay, DisplayedBodies, remote_hands};
 
@@ -44,17 +44,6 @@ pub(super) fn agreed_settings(body: &Body) -> StepSettings {
     StepSettings { gravity, ..settings }
 }
 
-/// A local grab as the session knows it.
-pub(super) struct PeerGrab {
-    body: BodyId,
-    vertex: u32,
-    radius: f64,
-    hold: GrabConfig,
-    /// The session's number of the grab. `None`: the session did not take it.
-    number: Option<u16>,
-    point: Option<PatchPoint>,
-}
-
 /// `PostUpdate`: passes the app's own grabs to the session.
 pub(crate) fn send_hands(
     net: Option<ResMut<NetPeer>>,
@@ -70,10 +59,7 @@ pub(crate) fn send_hands(
     let number_of =
         |entity: Entity| net.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id);
     net.grabs.retain(|&entity, sent| {
-        let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == sent.vertex && grab.radius == sent.radius && holds_so(grab, &sent.hold);
-            same && number_of(of.0) == Some(sent.body)
-        });
+        let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| sent.is(grab, number_of(of.0)));
         if let (false, Some(number)) = (stays, sent.number) {
             session.end_grab(number);
         }
@@ -83,20 +69,18 @@ pub(crate) fn send_hands(
         let (Some(id), Ok((state, transform))) = (number_of(of.0), bodies.get(of.0)) else { continue };
         let Some(place) = SessionTransform::of_body(transform, state) else { continue };
         let target = place.point_to_session(grab.target);
-        let moved = match net.grabs.get(&entity) {
-            Some(sent) => sent.number.map(|number| session.set_target(number, target)).transpose(),
-            None => {
-                let hold = hold_of(grab);
-                let begun = session.begin_grab(id, grab.vertex, grab.radius, target, hold);
-                let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
-                let (vertex, radius) = (grab.vertex, grab.radius);
-                let number = begun.as_ref().ok().copied();
-                net.grabs.insert(entity, PeerGrab { body: id, vertex, radius, hold, number, point });
-                begun.map(|_| None)
+        match net.grabs.get(&entity) {
+            Some(sent) => {
+                if let Some(Err(error)) = sent.number.map(|number| session.set_target(number, target)) {
+                    debug!("a target was not taken: {error}");
+                }
             }
-        };
-        if let Err(error) = moved {
-            debug!("a grab was not taken: {error}");
+            None => {
+                let own = OwnGrab::begin(id, grab, state.model(), |hold| {
+                    session.begin_grab(id, grab.vertex, grab.radius, target, hold)
+                });
+                net.grabs.insert(entity, own);
+            }
         }
     }
 }
@@ -125,12 +109,12 @@ pub(crate) fn show(
         hands.set_if_neq(remote_hands(view.grabs(), Some(user), &place));
         for (&entity, sent) in net.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
-            let grab_force = sent.number.and_then(|grab| {
+            let reaction = sent.number.and_then(|grab| {
                 let key = GrabKey { user, grab };
-                let reaction = view.grabs().iter().find(|grab| grab.key == key)?.reaction;
-                Some(played.display.force(reaction, sent.point.as_ref()?, &place, state, &visual))
+                Some(view.grabs().iter().find(|grab| grab.key == key)?.reaction)
             });
-            force.set_if_neq(grab_force.unwrap_or_default());
+            let at = (&place, state, &*visual);
+            sent.write_force(&mut force, reaction, f64::INFINITY, &played.display, at);
         }
     }
     net.flush();
