@@ -10,9 +10,9 @@ use pliant_modal::GrabConfig;
 use pliant_stream::emulator::{LinkConfig, Preset};
 use pliant_stream::{
     GrabKey, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
-    RigidState, StepSettings, UserId,
+    RigidState, StepSettings,
 };
-use support::scene::{BODY, S, Scene, cached, circling, circling_with, start};
+use support::scene::{BODY, Observed, S, Scene, cached, circling, circling_with, start};
 use support::{bar, loose_bar};
 
 #[test]
@@ -110,40 +110,32 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
     let settings = StepSettings { gravity: [0.0, 0.0, -0.3], ..Default::default() };
     let mut pair = Pair::new(HostSessionConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
-    struct Watch(Scene, Vec<(u64, RigidState)>, Vec<(u64, RigidState)>);
-    impl World for Watch {
-        fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
-            self.0.step(now, tick, host);
-        }
-        fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
-            self.0.host_event(now, event, host);
-        }
-        fn guest_stepped(&mut self, now: Duration, guest: usize, stepped: u64, session: &mut GuestSession) {
-            self.0.guest_stepped(now, guest, stepped, session);
-            let Some(view) = session.body(BODY).filter(|_| stepped > 0 && now > 6 * S) else { return };
-            self.2.extend(view.pose().map(|pose| (view.tick(), pose)));
-            let Some(own) = view.predicted_hand() else { return };
-            self.1.push((own.tick(), own.pose().expect("a free body has a frame")));
-        }
-    }
-    let mut watch = Watch(Scene::with(&model, &settings), Vec::new(), Vec::new());
-    watch.0.hand = circling();
+    let (mut own, mut shown) = (Vec::new(), Vec::new());
+    let look = |now: Duration, _: usize, stepped: u64, session: &mut GuestSession| {
+        let Some(view) = session.body(BODY).filter(|_| stepped > 0 && now > 6 * S) else { return };
+        shown.extend(view.pose().map(|pose| (view.tick(), pose)));
+        let Some(predicted) = view.predicted_hand() else { return };
+        own.push((predicted.tick(), predicted.pose().expect("a free body has a frame")));
+    };
+    let mut world = Observed { scene: Scene::with(&model, &settings), look };
+    world.scene.hand = circling();
     let path = PathConfig::symmetric(LinkConfig::preset(Preset::Paper2));
     pair.join_with(GuestSessionConfig::default(), path, 3, cached(&model)).unwrap();
-    pair.run_until(25 * S, &mut watch);
+    pair.run_until(25 * S, &mut world);
+    let poses = &world.scene.poses;
     let off = |seen: &[(u64, RigidState)]| {
         let (mut sum, mut count) = (0.0, 0.0_f64);
         for (tick, pose) in seen {
-            let Some((_, truth)) = watch.0.poses.iter().find(|p| p.0 == *tick) else { continue };
+            let Some((_, truth)) = poses.iter().find(|p| p.0 == *tick) else { continue };
             sum += (0..3).map(|k| (pose.position[k] - truth.position[k]).powi(2)).sum::<f64>();
             count += 1.0;
         }
         assert!(count > 500.0, "{count} ticks compared");
         (sum / count).sqrt()
     };
-    let moved = watch.0.poses.iter().map(|p| p.1.position.iter().map(|x| x * x).sum::<f64>().sqrt());
+    let moved = poses.iter().map(|p| p.1.position.iter().map(|x| x * x).sum::<f64>().sqrt());
     let moved = moved.fold(0.0, f64::max);
-    let (own, shown) = (off(&watch.1), off(&watch.2));
+    let (own, shown) = (off(&own), off(&shown));
     println!("moved by {moved:.3} m; own copy off by {own:.5} m, shown by {shown:.5} m");
     assert!(moved > 0.1);
     assert!(own < 0.02 * moved, "{own} m of {moved} m");
@@ -158,28 +150,19 @@ fn anothers_soft_hand_on_a_free_body_is_predicted_as_soft_as_it_is() {
     let model = loose_bar(24, 0.05);
     let mut pair = Pair::new(HostSessionConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
-    struct Watch(Scene, Vec<(u64, RigidState, [f64; 3])>, Option<UserId>);
-    impl World for Watch {
-        fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
-            self.0.step(now, tick, host);
-        }
-        fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
-            self.0.host_event(now, event, host);
-        }
-        fn guest_stepped(&mut self, now: Duration, guest: usize, stepped: u64, session: &mut GuestSession) {
-            self.0.guest_stepped(now, guest, stepped, session);
-            let Some(view) = session.body(BODY).filter(|_| guest == 1 && stepped > 0 && now > 6 * S) else {
-                return;
-            };
-            let Some(own) = view.predicted_hand() else { return };
-            self.2 = session.user();
-            self.1.extend(own.pose().zip(own.reaction(0)).map(|(pose, f)| (own.tick(), pose, f)));
-        }
-    }
-    let mut watch = Watch(Scene::with(&model, &StepSettings::default()), Vec::new(), None);
+    let (mut seen, mut user) = (Vec::new(), None);
+    let look = |now: Duration, guest: usize, stepped: u64, session: &mut GuestSession| {
+        let Some(view) = session.body(BODY).filter(|_| guest == 1 && stepped > 0 && now > 6 * S) else {
+            return;
+        };
+        let Some(own) = view.predicted_hand() else { return };
+        user = session.user();
+        seen.extend(own.pose().zip(own.reaction(0)).map(|(pose, f)| (own.tick(), pose, f)));
+    };
+    let mut world = Observed { scene: Scene::with(&model, &StepSettings::default()), look };
     let mut swing = circling_with(GrabConfig { stiffness: Some(20.0), relaxation: 0.1 });
     let mut grab = None;
-    watch.0.hand = Box::new(move |now, guest, session| {
+    world.scene.hand = Box::new(move |now, guest, session| {
         swing(now, guest, session);
         if guest == 1 && session.user().is_some() && grab.is_none() {
             let own = GrabConfig { stiffness: Some(40.0), relaxation: 0.1 };
@@ -190,12 +173,12 @@ fn anothers_soft_hand_on_a_free_body_is_predicted_as_soft_as_it_is() {
     for seed in [3, 4] {
         pair.join_with(GuestSessionConfig::default(), path.clone(), seed, cached(&model)).unwrap();
     }
-    pair.run_until(25 * S, &mut watch);
-    let Watch(scene, seen, user) = &watch;
+    pair.run_until(25 * S, &mut world);
+    let scene = &world.scene;
     let key = GrabKey { user: user.expect("the second guest has joined"), grab: 0 };
     let far2 = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>();
     let (mut place, mut force, mut strongest, mut count) = (0.0, 0.0, 0.0f64, 0.0);
-    for (tick, pose, reaction) in seen {
+    for (tick, pose, reaction) in &seen {
         let Some((_, truth)) = scene.poses.iter().find(|p| p.0 == *tick) else { continue };
         let Some((_, _, right)) = scene.reactions.iter().find(|r| r.0 == *tick && r.1 == key) else {
             continue;

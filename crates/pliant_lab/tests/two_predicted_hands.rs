@@ -12,47 +12,15 @@ mod support;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_lab::pair::{PathConfig, World};
+use pliant_lab::pair::PathConfig;
 use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Preset};
-use pliant_stream::{GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession};
+use pliant_stream::{GuestSession, GuestSessionConfig};
 use support::bar;
-use support::scene::{BODY, HandScript, S, Scene, cached, start};
+use support::scene::{BODY, HandScript, Observed, S, cached, start};
 
 /// A shape, and the tick that the shape stands for.
 type Shown = (u64, Vec<f64>);
-
-struct Watch {
-    scene: Scene,
-    streamed: Vec<Shown>,
-    own: Vec<Shown>,
-    waiting: Vec<Shown>,
-}
-
-impl World for Watch {
-    fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
-        self.scene.step(now, tick, host);
-    }
-    fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
-        self.scene.host_event(now, event, host);
-    }
-    fn guest_event(&mut self, now: Duration, guest: usize, event: GuestEvent, s: &mut GuestSession) {
-        self.scene.guest_event(now, guest, event, s);
-    }
-    fn guest_stepped(&mut self, now: Duration, guest: usize, stepped: u64, session: &mut GuestSession) {
-        self.scene.guest_stepped(now, guest, stepped, session);
-        let Some(view) = session.body(BODY).filter(|_| guest == 0 && stepped > 0 && now > 4 * S) else {
-            return;
-        };
-        let Some(streamed) = view.visual() else { return };
-        self.streamed.push((view.tick(), streamed.q.clone()));
-        let Some(own) = view.predicted_hand() else { return };
-        if self.own.last().is_none_or(|last| last.0 < own.tick()) {
-            self.own.push((own.tick(), own.visual().q.clone()));
-            self.waiting.push((own.tick(), streamed.q.clone()));
-        }
-    }
-}
 
 /// Error against the host's shapes of the same ticks over the surface, root mean square and
 /// largest, as shares of the largest displacement.
@@ -138,16 +106,30 @@ fn hands(other: Other) -> HandScript {
 /// (root mean square), waiting (root mean square).
 fn run(model: &Arc<ModalModel>, preset: Preset, other: Other) -> [f64; 4] {
     let (mut pair, scene) = start(model);
-    let mut watch = Watch { scene, streamed: Vec::new(), own: Vec::new(), waiting: Vec::new() };
-    watch.scene.hand = hands(other);
+    let (mut streamed, mut own, mut waiting) =
+        (Vec::<Shown>::new(), Vec::<Shown>::new(), Vec::<Shown>::new());
+    let look = |now: Duration, guest: usize, stepped: u64, session: &mut GuestSession| {
+        let Some(view) = session.body(BODY).filter(|_| guest == 0 && stepped > 0 && now > 4 * S) else {
+            return;
+        };
+        let Some(seen) = view.visual() else { return };
+        streamed.push((view.tick(), seen.q.clone()));
+        let Some(predicted) = view.predicted_hand() else { return };
+        if own.last().is_none_or(|last| last.0 < predicted.tick()) {
+            own.push((predicted.tick(), predicted.visual().q.clone()));
+            waiting.push((predicted.tick(), seen.q.clone()));
+        }
+    };
+    let mut world = Observed { scene, look };
+    world.scene.hand = hands(other);
     let path = PathConfig::symmetric(LinkConfig::preset(preset));
     for seed in [3, 4] {
         pair.join_with(GuestSessionConfig::default(), path.clone(), seed, cached(model)).unwrap();
     }
-    pair.run_until(40 * S, &mut watch);
-    let truth = &watch.scene.truth;
-    let (streamed, most) = off(model, truth, &watch.streamed);
-    let [own, waiting] = [&watch.own, &watch.waiting].map(|seen| off(model, truth, seen).0);
+    pair.run_until(40 * S, &mut world);
+    let truth = &world.scene.truth;
+    let (streamed, most) = off(model, truth, &streamed);
+    let [own, waiting] = [&own, &waiting].map(|seen| off(model, truth, seen).0);
     println!(
         "{}: streamed {:.4} % rms, {:.2} % at most; predicted hand {:.3} %, waiting {:.2} %",
         preset.name(),

@@ -145,6 +145,32 @@ impl World for Scene {
     }
 }
 
+/// A scene, and what looks at a guest after each of its updates. Arguments: time, guest, number of
+/// ticks, session.
+pub struct Observed<F> {
+    pub scene: Scene,
+    pub look: F,
+}
+
+impl<F: FnMut(Duration, usize, u64, &mut GuestSession)> World for Observed<F> {
+    fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
+        self.scene.step(now, tick, host);
+    }
+
+    fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
+        self.scene.host_event(now, event, host);
+    }
+
+    fn guest_event(&mut self, now: Duration, guest: usize, event: GuestEvent, s: &mut GuestSession) {
+        self.scene.guest_event(now, guest, event, s);
+    }
+
+    fn guest_stepped(&mut self, now: Duration, guest: usize, stepped: u64, session: &mut GuestSession) {
+        self.scene.guest_stepped(now, guest, stepped, session);
+        (self.look)(now, guest, stepped, session);
+    }
+}
+
 /// Guest 0 grabs the tip as soon as possible and moves in a circle.
 pub fn circling() -> HandScript {
     circling_with(GrabConfig::default())
