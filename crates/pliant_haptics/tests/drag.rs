@@ -86,8 +86,8 @@ fn a_free_body_weighs_as_much_when_it_is_lowered() {
                 }
                 let mean = sum / 2000.0;
                 (lowest, largest) = (lowest.min(mean), largest.max(mean));
-                // A hand that lifts and lowers slowly carries the weight, whichever way it moves. The
-                // difference is the damper's.
+                // A hand that lifts and lowers slowly carries the weight, whichever way it moves.
+                // The difference is the damper's.
                 assert!((mean - WEIGHT).abs() < 0.15 * WEIGHT, "round {round}, to {to} m: {mean} N");
             }
         }
