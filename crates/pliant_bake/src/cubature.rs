@@ -172,5 +172,6 @@ fn pulled(energy: &mut ElasticEnergy, omega: &[f64], patch: &Rows, training: &Tr
         .flat_map(|(axis, sign)| {
             cubature::guided_shapes(energy, omega, patch, &(sign * axes[axis]), &ways, most)
         })
+        .map(|shape| shape.q)
         .collect()
 }

@@ -102,12 +102,12 @@ fn shapes_of_the_patch_give_the_force_and_the_dent() {
     let around = |at, radius| Patch::around(model.surface(), vertex(&model, at), radius).unwrap();
     type Row = (&'static str, Vector, f64, Vector, [f64; 2]);
     let rows: [Row; 5] = [
-        ("corner of the end by .08", [1.0, 0.1, 0.1], 0.05, [0.0, 0.056, 0.056], [0.01, 1e-3]),
-        ("corner of the end by .28", [1.0, 0.1, 0.1], 0.05, [0.0, 0.196, 0.196], [0.03, 0.01]),
-        ("side of the middle by .08", [0.5, 0.1, 0.05], 0.05, [0.0, 0.08, 0.0], [0.02, 3e-3]),
+        ("corner of the end by .08", [1.0, 0.1, 0.1], 0.05, [0.0, 0.056, 0.056], [5e-3, 1e-3]),
+        ("corner of the end by .28", [1.0, 0.1, 0.1], 0.05, [0.0, 0.196, 0.196], [0.01, 5e-3]),
+        ("side of the middle by .08", [0.5, 0.1, 0.05], 0.05, [0.0, 0.08, 0.0], [5e-3, 2e-3]),
         // A bar that is led so far by its middle bends in more ways than the coordinates have.
-        ("side of the middle by .28", [0.5, 0.1, 0.05], 0.05, [0.0, 0.28, 0.0], [0.13, 0.06]),
-        ("end, sideways by .5", [1.0, 0.05, 0.05], 0.08, [0.0, 0.5, 0.0], [0.04, 0.015]),
+        ("side of the middle by .28", [0.5, 0.1, 0.05], 0.05, [0.0, 0.28, 0.0], [0.08, 0.03]),
+        ("end, sideways by .5", [1.0, 0.05, 0.05], 0.08, [0.0, 0.5, 0.0], [0.03, 0.01]),
     ];
     for (name, at, radius, way, bounds) in rows {
         let [without, with] = errors(&mesh, &model, &[(around(at, radius), way)]);
@@ -120,9 +120,7 @@ fn shapes_of_the_patch_give_the_force_and_the_dent() {
     ];
     let [without, with] = errors(&mesh, &model, &two);
     println!("two hands that shear: {with:.4?}, without the shapes {without:.4?}");
-    // Two hands so near each other bend the bar between them in more ways than their shapes have
-    // (docs/limits.md). The surface is right.
-    assert!(with[0] < 0.1 && with[0] < without[0] && with[1] < 3e-3, "{with:?}");
+    assert!(with[0] < 0.03 && with[1] < 2e-3, "{with:?}");
 }
 
 #[test]
@@ -178,7 +176,7 @@ fn a_hand_that_gets_its_shapes_late_feels_no_kick() {
     assert!(most < 1.3 * settled + 0.01 * norm(before), "{most} {settled}");
 }
 
-/// Torn or pressed like this at 240 Hz, the bar does not come to rest in eight seconds
+/// Pressed like this at 240 Hz, the bar gains three percent of its energy when it is let go
 /// (docs/limits.md).
 #[test]
 fn jerks_folds_and_tearing_stay_calm_with_shapes() {
@@ -186,13 +184,14 @@ fn jerks_folds_and_tearing_stay_calm_with_shapes() {
     let end = Patch::around(model.surface(), vertex(&model, [1.0, 0.1, 0.1]), 0.05).unwrap();
     let side = Patch::around(model.surface(), vertex(&model, [0.5, 0.1, 0.05]), 0.05).unwrap();
     let shapes = Arc::new(HeldShapes::new(&model, &[end.clone(), side.clone()]).unwrap().unwrap());
-    let cases: [(&str, f64, Vector, Vector); 6] = [
+    let cases: [(&str, f64, Vector, Vector); 7] = [
         ("jerk", 60.0, [0.0, 0.7, 0.0], [0.0; 3]),
         ("fold", 60.0, [-1.2, 0.05, 0.0], [0.0, 0.3, 0.0]),
         ("tear", 60.0, [0.7, 0.0, 0.0], [-0.3, 0.2, 0.0]),
         ("press", 60.0, [-0.5, 0.0, 0.0], [0.0, -0.3, 0.0]),
         ("jerk", 240.0, [0.0, 0.7, 0.0], [0.0; 3]),
         ("fold", 240.0, [-1.2, 0.05, 0.0], [0.0, 0.3, 0.0]),
+        ("tear", 240.0, [0.7, 0.0, 0.0], [-0.3, 0.2, 0.0]),
     ];
     for (name, rate, first, second) in cases {
         let mut body = reduced(&model, 1.0 / rate, 1.0);

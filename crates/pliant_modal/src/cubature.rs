@@ -73,19 +73,28 @@ pub fn guided_shapes(
     direction: &Vector3<f64>,
     ways: &[f64],
     most: f64,
-) -> Vec<Vec<f64>> {
+) -> Vec<GuidedShape> {
     let mut q = vec![0.0; omega.len()];
     let mut out = Vec::new();
     for way in ways {
         let Some(next) = hold(energy, omega, patch, &(*way * direction), &q) else { break };
-        let reached = energy.energy(&next);
+        let reached = energy.energy(&next.q);
         if reached.is_nan() || reached > most {
             break;
         }
-        q = next;
-        out.push(q.clone());
+        q.clone_from(&next.q);
+        out.push(next);
     }
     out
+}
+
+/// A shape in which a patch is held.
+#[derive(Debug, Clone)]
+pub struct GuidedShape {
+    /// Coordinates.
+    pub q: Vec<f64>,
+    /// Force that holds the patch there, N.
+    pub force: Vector3<f64>,
 }
 
 /// Returns roughly the shape of least energy in which a patch is displaced by `there` (m), from the
@@ -96,10 +105,11 @@ fn hold(
     patch: &Rows,
     there: &Vector3<f64>,
     start: &[f64],
-) -> Option<Vec<f64>> {
+) -> Option<GuidedShape> {
     const ROUNDS: usize = 5;
     let m = start.len();
     let mut q = start.to_vec();
+    let mut force = Vector3::zeros();
     let mut factor = Cholesky::new(m);
     for _ in 0..ROUNDS {
         energy.linearize(&q);
@@ -117,10 +127,10 @@ fn hold(
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         let gap = there - Vector3::from_fn(|axis, _| dot(&patch[axis], &q) - dot(&patch[axis], &free));
         let inner = Matrix3::from_fn(|a, b| dot(&patch[a], &soft[b]));
-        let pull = inner.try_inverse()? * gap;
+        force = inner.try_inverse()? * gap;
         let (mut way, mut length) = (0.0, 0.0);
         for (i, q) in q.iter_mut().enumerate() {
-            let step = pull[0] * soft[0][i] + pull[1] * soft[1][i] + pull[2] * soft[2][i] - free[i];
+            let step = force[0] * soft[0][i] + force[1] * soft[1][i] + force[2] * soft[2][i] - free[i];
             *q += step;
             way += (omega[i] * step).powi(2);
             length += (omega[i] * *q).powi(2);
@@ -129,7 +139,7 @@ fn hold(
             break;
         }
     }
-    q.iter().all(|x| x.is_finite()).then_some(q)
+    q.iter().chain(force.iter()).all(|x| x.is_finite()).then_some(GuidedShape { q, force })
 }
 
 /// What the weights of a rule are fitted to.

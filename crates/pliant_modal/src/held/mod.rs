@@ -16,31 +16,33 @@
 //! use of attachment modes in substructure coupling for dynamic analysis*, 1977). Together with the
 //! coordinates they get a cubature rule of their own.
 //!
+//! Where a hand pulls far, shapes of second order are not enough. Further columns are the corrections
+//! that a Newton step of the full elements makes to shapes in which the hands pull far along the
+//! axes.
+//!
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 
+mod columns;
 mod mesh;
 mod region;
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{Matrix3, Vector3};
 
 pub use mesh::{SimulationMesh, VertexPlace};
 
-use self::region::Region;
+use self::{
+    columns::{Columns, guided},
+    region::{Load, Region},
+};
 use crate::{
-    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, ReducedElasticity, StepError,
+    HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, StepError,
     cubature::{self, Fit, Point},
     nonlinear::Gradients,
     step::{contact_floor, residual},
     tetrahedron,
 };
-
-/// Combinations of columns with less than this share of the largest energy are rounding errors.
-const LEAST: f64 = 1e-6;
-
-/// Combinations of columns of which the coordinates have all but this share of the energy end.
-const NEW: f64 = 1e-3;
 
 /// Number of points outside of the region to choose from.
 const OUTSIDE: usize = 400;
@@ -50,7 +52,7 @@ const OUTSIDE: usize = 400;
 const REFERENCE: usize = 24_000;
 
 /// Number of points inside the region to choose from.
-const INSIDE: usize = 1_600;
+const INSIDE: usize = 4_000;
 
 /// Number of points, outside and inside, that find the training shapes.
 const COARSE: [usize; 2] = [150, 300];
@@ -60,9 +62,6 @@ const POINTS_PER_COORDINATE: usize = 4;
 
 /// Error of the forces over the training shapes at which no more points are added.
 const TOLERANCE: f64 = 3e-3;
-
-/// Largest energy density of a training shape, as a share of Young's modulus.
-const ENERGY: f64 = 0.02;
 
 /// Ways of a hand in the training shapes, as shares of the body's size.
 const WAYS: [f64; 4] = [0.04, 0.12, 0.25, 0.5];
@@ -133,28 +132,21 @@ impl HeldShapes {
         if !region.is_held() {
             return Ok(None);
         }
-        let Some(columns) = columns(&region, patches, law).and_then(|c| c.beside(model, &region)) else {
-            return Ok(None);
-        };
+        let loads: Vec<Load> = patches.iter().map(|patch| region.load(patch)).collect();
+        let columns = Columns::new(model, &region, &loads, law)
+            .and_then(|columns| columns.corrected(model, &region, &loads, law));
+        let Some(columns) = columns else { return Ok(None) };
         let width = columns.width;
-        let mut rows = Vec::with_capacity(patches.len());
-        let mut whole = Vec::with_capacity(patches.len());
-        let mut residuals = Vec::with_capacity(patches.len());
-        for patch in patches {
-            let (mut own, modal) = region.mean(&region.load(patch), &columns.values, width);
-            for (own, modal) in own.iter_mut().zip(&modal) {
-                columns.take_out(modal, own);
-            }
-            if !own.iter().chain(&modal).flatten().all(|x| x.is_finite()) {
-                return Ok(None);
-            }
-            residuals.push(left_over(model, patch, &own)?);
-            let joined = |axis: usize| own[axis].iter().chain(&modal[axis]).copied().collect();
-            whole.push(std::array::from_fn(joined));
-            rows.push(own);
+        let whole = columns.rows(&region, &loads);
+        if !whole.iter().flatten().flatten().all(|x| x.is_finite()) {
+            return Ok(None);
         }
+        let own = |rows: &cubature::Rows| rows.each_ref().map(|row| row[..width].to_vec());
+        let rows: Vec<cubature::Rows> = whole.iter().map(own).collect();
+        let residuals = patches.iter().zip(&rows).map(|(patch, own)| left_over(model, patch, own));
+        let residuals = residuals.collect::<Result<Vec<_>, _>>()?;
         let Some(rule) = rule(model, &region, law, &columns, &whole) else { return Ok(None) };
-        let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
+        let omega = columns.omega(model);
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
         let mut at = vec![0.0; 3 * width];
         for vertex in 0..count as u32 {
@@ -280,31 +272,6 @@ impl HeldShapes {
     }
 }
 
-/// Makes the columns of all patches, with `X^T K X` the identity.
-fn columns(region: &Region<'_>, patches: &[Patch], law: Hyperelastic) -> Option<Columns> {
-    let width = 9 * patches.len();
-    let mut all = vec![0.0; 3 * region.node_count() * width];
-    for (index, patch) in patches.iter().enumerate() {
-        let shapes = region.static_shapes(index, &region.load(patch), law);
-        for (all, own) in all.chunks_exact_mut(width).zip(shapes.chunks_exact(9)) {
-            all[9 * index..9 * (index + 1)].copy_from_slice(own);
-        }
-    }
-    let energies = region.energies(&all, width);
-    let scale: Vec<f64> = (0..width)
-        .map(|k| energies[k * width + k])
-        .map(|energy| if energy > 0.0 { 1.0 / energy.sqrt() } else { 0.0 })
-        .collect();
-    let scaled = DMatrix::from_fn(width, width, |i, j| {
-        0.5 * scale[i] * scale[j] * (energies[i * width + j] + energies[j * width + i])
-    });
-    let mut combine = orthonormal(scaled, LEAST)?;
-    for (mut row, scale) in combine.row_iter_mut().zip(&scale) {
-        row *= *scale;
-    }
-    Some(Columns { values: combined(&all, &combine), width: combine.ncols(), parts: Vec::new() })
-}
-
 /// What is left of a patch's residual flexibility beside the columns, m/N: the static compliance
 /// minus that of coordinates and columns together, where it is positive.
 fn left_over(model: &ModalModel, patch: &Patch, own: &cubature::Rows) -> Result<Matrix3<f64>, StepError> {
@@ -317,73 +284,6 @@ fn left_over(model: &ModalModel, patch: &Patch, own: &cubature::Rows) -> Result<
     Ok(eigen.eigenvectors * kept * eigen.eigenvectors.transpose())
 }
 
-/// Columns on a region.
-struct Columns {
-    /// Displacements `X`, `[node][axis][column]`.
-    values: Vec<f64>,
-    width: usize,
-    /// The coordinates' part `P` that is taken out of them, `[coordinate][column]`.
-    parts: Vec<f64>,
-}
-
-impl Columns {
-    /// Takes the coordinates' part out of columns that have energy one, and scales what is left to
-    /// energy one. Returns `None` if nothing is left.
-    fn beside(self, model: &ModalModel, region: &Region<'_>) -> Option<Self> {
-        let (width, omega) = (self.width, model.omega());
-        let coupling = region.coupling(&self.values, width);
-        let soft = |i: usize, j: usize| -> f64 {
-            let rows = coupling.chunks_exact(width).zip(omega);
-            rows.map(|(row, omega)| row[i] * row[j] / (omega * omega)).sum()
-        };
-        let left = DMatrix::from_fn(width, width, |i, j| f64::from(u8::from(i == j)) - soft(i, j));
-        let combine = orthonormal(left, NEW)?;
-        let values = combined(&self.values, &combine);
-        let mut parts = combined(&coupling, &combine);
-        for (row, omega) in parts.chunks_exact_mut(combine.ncols()).zip(omega) {
-            row.iter_mut().for_each(|x| *x /= omega * omega);
-        }
-        let is_sound = values.iter().chain(&parts).all(|x| x.is_finite());
-        is_sound.then_some(Self { values, width: combine.ncols(), parts })
-    }
-
-    /// Takes the coordinates' part out of a row of columns.
-    fn take_out(&self, modal: &[f64], row: &mut [f64]) {
-        for (modal, parts) in modal.iter().zip(self.parts.chunks_exact(self.width)) {
-            row.iter_mut().zip(parts).for_each(|(x, part)| *x -= modal * part);
-        }
-    }
-}
-
-/// The combinations of columns that have energy one each and none together, given the energies of
-/// all pairs. Those with less than a share of the largest energy end.
-fn orthonormal(energies: DMatrix<f64>, least: f64) -> Option<DMatrix<f64>> {
-    if !energies.iter().all(|x| x.is_finite()) {
-        return None;
-    }
-    let width = energies.ncols();
-    let eigen = energies.symmetric_eigen();
-    let most = eigen.eigenvalues.max();
-    let mut kept: Vec<usize> =
-        (0..width).filter(|&k| eigen.eigenvalues[k] > least * most && most > 0.0).collect();
-    kept.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
-    if kept.is_empty() {
-        return None;
-    }
-    Some(DMatrix::from_fn(width, kept.len(), |row, column| {
-        let k = kept[column];
-        eigen.eigenvectors[(row, k)] / eigen.eigenvalues[k].sqrt()
-    }))
-}
-
-/// Combines columns of a matrix that is stored row by row.
-fn combined(rows: &[f64], combine: &DMatrix<f64>) -> Vec<f64> {
-    let entry =
-        |row: &[f64], column: usize| row.iter().zip(combine.column(column).iter()).map(|(x, c)| x * c).sum();
-    let rows = rows.chunks_exact(combine.nrows());
-    rows.flat_map(|row| (0..combine.ncols()).map(move |column| entry(row, column))).collect()
-}
-
 /// Makes the rule of columns and coordinates. `patches` has the mean displacements of the patches
 /// by both. Returns `None` if no shape can be found.
 fn rule(
@@ -393,8 +293,7 @@ fn rule(
     columns: &Columns,
     patches: &[cubature::Rows],
 ) -> Option<Vec<Point>> {
-    let omega: Vec<f64> =
-        std::iter::repeat_n(1.0, columns.width).chain(model.omega().iter().copied()).collect();
+    let omega = columns.omega(model);
     let m = omega.len();
     let inside = region.inside(columns);
     let reference = region.outside(model.size(), REFERENCE, columns);
@@ -402,23 +301,8 @@ fn rule(
         thinned(&reference, OUTSIDE).into_iter().chain(thinned(&inside, INSIDE)).collect();
     let coarse: Vec<Point> =
         thinned(&reference, COARSE[0]).into_iter().chain(thinned(&inside, COARSE[1])).collect();
-    let few = ReducedElasticity {
-        material: model.material()?,
-        weights: coarse.iter().map(|point| point.weight).collect(),
-        gradients: coarse.iter().flat_map(|point| point.gradients.iter().map(|&x| x as f32)).collect(),
-        mesh: None,
-    };
-    let mut energy = ElasticEnergy::new(&few, law, &omega).ok()?;
-    let most = ENERGY * model.info().young * energy.volume();
-    let ways = WAYS.map(|way| way * model.size());
-    let mut shapes = Vec::new();
-    for patch in patches {
-        for direction in
-            [Vector3::x(), -Vector3::x(), Vector3::y(), -Vector3::y(), Vector3::z(), -Vector3::z()]
-        {
-            shapes.extend(cubature::guided_shapes(&mut energy, &omega, patch, &direction, &ways, most));
-        }
-    }
+    let shapes = guided(model, law, &omega, &coarse, patches, &WAYS)?;
+    let shapes: Vec<Vec<f64>> = shapes.into_iter().map(|(_, shape)| shape.q).collect();
     let whole = || reference.iter().chain(&inside);
     let forces: Vec<Vec<f64>> = shapes
         .iter()

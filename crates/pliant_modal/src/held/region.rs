@@ -245,6 +245,57 @@ impl<'a> Region<'a> {
         out
     }
 
+    /// Displacements by which a Newton step with the stiffness at rest corrects given displacements
+    /// of the region, where a force (N) acts on the load of the patch with this index. `given` and
+    /// the result are `[node][axis][case]`.
+    pub(super) fn corrections(
+        &self,
+        index: usize,
+        load: &Load,
+        forces: &[Vector3<f64>],
+        given: &[f64],
+        law: Hyperelastic,
+    ) -> Vec<f64> {
+        let cases = forces.len();
+        let mut out = vec![0.0; given.len()];
+        for &(node, share) in load {
+            let Ok(at) = self.numbers.binary_search(&node) else { continue };
+            for (axis, out) in out[3 * at * cases..][..3 * cases].chunks_exact_mut(cases).enumerate() {
+                out.iter_mut().zip(forces).for_each(|(out, force)| *out += share * force[axis]);
+            }
+        }
+        let mut u = vec![0.0; 3 * self.node_count()];
+        for case in 0..cases {
+            u.iter_mut().zip(given.iter().skip(case).step_by(cases)).for_each(|(u, given)| *u = *given);
+            for element in 0..self.elements.len() {
+                self.at_points(element, &u, &mut [Matrix3::zeros()], |weight, nodes, g, [h]| {
+                    let stress = weight * law.stress(h);
+                    for (&node, g) in nodes.iter().zip(g) {
+                        let force = stress * g;
+                        let at = 3 * node as usize;
+                        (0..3).for_each(|axis| out[(at + axis) * cases + case] -= force[axis]);
+                    }
+                });
+            }
+        }
+        self.stiffness.solve(&self.free[index], &mut out, cases);
+        out
+    }
+
+    /// Displacements of the region's nodes by the coordinates and columns, `[node][axis]`, m.
+    pub(super) fn displacements(&self, q: &[f64], columns: &[f64], s: &[f64]) -> Vec<f64> {
+        let (modes, width) = (self.mesh.scales.len(), s.len());
+        let mut phi = vec![0.0; 3 * modes];
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let mut out = Vec::with_capacity(3 * self.node_count());
+        for (&node, columns) in self.numbers.iter().zip(columns.chunks_exact(3 * width)) {
+            self.mesh.coordinates(node, &mut phi);
+            let rows = phi.chunks_exact(modes).zip(columns.chunks_exact(width));
+            out.extend(rows.map(|(phi, column)| dot(phi, q) + dot(column, s)));
+        }
+        out
+    }
+
     /// The nodal forces of second order of the pairs of three shapes.
     fn second_order_forces(&self, shapes: &[f64], law: Hyperelastic) -> Vec<f64> {
         const PAIRS: [(usize, usize); 6] = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)];
@@ -293,12 +344,12 @@ impl<'a> Region<'a> {
         }
     }
 
-    /// `X^T K Y` of columns on the region, row by row.
-    pub(super) fn energies(&self, columns: &[f64], width: usize) -> Vec<f64> {
-        let mut forces = vec![0.0; columns.len()];
-        self.stiffness.times(columns, width, &mut forces);
-        let mut out = vec![0.0; width * width];
-        for (x, f) in columns.chunks_exact(width).zip(forces.chunks_exact(width)) {
+    /// `A^T K B` of columns `a` and `b` on the region, row by row.
+    pub(super) fn energies(&self, [a, b]: [&[f64]; 2], [rows, width]: [usize; 2]) -> Vec<f64> {
+        let mut forces = vec![0.0; b.len()];
+        self.stiffness.times(b, width, &mut forces);
+        let mut out = vec![0.0; rows * width];
+        for (x, f) in a.chunks_exact(rows).zip(forces.chunks_exact(width)) {
             for (out, x) in out.chunks_exact_mut(width).zip(x) {
                 out.iter_mut().zip(f).for_each(|(out, f)| *out += x * f);
             }
