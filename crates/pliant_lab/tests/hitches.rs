@@ -26,6 +26,18 @@ const MAX: f64 = 20.0 / 40.0;
 /// the rounding of the frames.
 const MAX_SHOWN: f64 = 1.2 + 1e-4;
 
+/// The shape is back when it is off by no more than this share of the largest shape for a tenth of
+/// a second, and the time that this may take after a stall: half a second, and a tick, since the
+/// shape is looked at once a tick. Frames that the network loses afterwards
+/// cost what they cost without stalls too.
+const BACK: f64 = 0.01;
+const BACK_FOR: Duration = Duration::from_millis(100);
+const BACK_WITHIN: Duration = Duration::from_millis(525);
+
+/// How far the true reactions of sessions with stalls may exceed those of sessions without: a hand
+/// that is late is led back at the speed of a hand.
+const MAX_TRUE: f64 = 1.6;
+
 struct Hitched {
     scene: Scene,
     hands: BTreeMap<GrabKey, HandPlayout>,
@@ -102,6 +114,8 @@ enum Who {
 struct Outcome {
     shown: f64,
     truth: f64,
+    /// Longest time after a stall until the shape was back.
+    back: Duration,
     /// Largest error of the shown shape from half a second after a stall on, as a share of the
     /// largest shape.
     off: f64,
@@ -149,34 +163,66 @@ fn session(who: Who, seed: u64, lasts: Duration) -> Outcome {
     };
     let size = world.scene.size();
     let off = world.off.iter().filter(|o| calm(o.0)).map(|o| o.1).fold(0.0, f64::max) / size;
+    let back = stalls.iter().enumerate().filter_map(|(k, stall)| {
+        let until = stalls.get(k + 1)?.saturating_sub(S);
+        let from = world.off.partition_point(|o| o.0 < *stall);
+        let to = world.off.partition_point(|o| o.0 < until);
+        let mut since = *stall;
+        // Where nothing that the host has made is shown, the shape is not back.
+        let mut last = Duration::ZERO;
+        for (at, off) in world.off.get(from..to)? {
+            if *off > BACK * size || *at > last + BACK_FOR {
+                since = *at;
+            }
+            last = *at;
+            if *off <= BACK * size && *at >= since + BACK_FOR {
+                return Some(since - *stall);
+            }
+        }
+        // The next stall comes before a tenth of a second has passed.
+        (until > *stall + BACK_WITHIN + BACK_FOR).then(|| since.max(*stall) - *stall)
+    });
+    let back = back.max().unwrap_or_default();
     assert_eq!(pair.host.users().map(|(_, user, _)| user).collect::<Vec<_>>(), [UserId(1)]);
-    Outcome { shown: world.shown, truth: world.truth, off }
+    Outcome { shown: world.shown, truth: world.truth, back, off }
 }
 
-/// Prints and returns the worst outcomes of some seeds.
-fn worst(who: Who, seeds: u64, lasts: Duration) -> (f64, f64) {
+/// Prints and returns the worst of some seeds.
+fn worst(who: Who, seeds: u64, lasts: Duration) -> (f64, Outcome) {
     let all: Vec<Outcome> = (1..=seeds).map(|seed| session(who, seed, lasts)).collect();
-    let ratio = all.iter().map(|o| o.shown / o.truth).fold(0.0, f64::max);
-    let truth = all.iter().map(|o| o.truth).fold(0.0, f64::max);
-    let off = all.iter().map(|o| o.off).fold(0.0, f64::max);
+    let largest = |of: fn(&Outcome) -> f64| all.iter().map(of).fold(0.0, f64::max);
+    let ratio = largest(|o| o.shown / o.truth);
+    let (shown, truth, off) = (largest(|o| o.shown), largest(|o| o.truth), largest(|o| o.off));
+    let back = all.iter().map(|o| o.back).max().unwrap_or_default();
     println!(
         "{who:?}: {seeds} sessions of {lasts:?}: largest reaction shown over largest true one {ratio:.3} \
-         (true {truth:.2} N), shape off by {:.2} % half a second after a stall",
+         (true {truth:.2} N), shape within 1 % after {back:.0?}, off by {:.2} % at worst from half a \
+         second after a stall on",
         100.0 * off
     );
-    (ratio, off)
+    (ratio, Outcome { shown, truth, back, off })
+}
+
+/// Fails where stalls are felt, or seen for longer than half a second.
+fn check(seeds: u64, lasts: Duration) {
+    let (_, calm) = worst(Who::Nobody, seeds, lasts);
+    for who in [Who::Host, Who::Guest, Who::Both] {
+        let (ratio, Outcome { truth, back, .. }) = worst(who, seeds, lasts);
+        assert!(ratio <= MAX_SHOWN, "{who:?}: shown {ratio:.3} of the true reaction");
+        let most = MAX_TRUE * calm.truth;
+        assert!(truth <= most, "{who:?}: true {truth:.2} N, {:.2} N without stalls", calm.truth);
+        assert!(back <= BACK_WITHIN, "{who:?}: the shape is back after {back:?}");
+    }
 }
 
 #[test]
 fn hitches_are_not_kicks() {
-    let all = [Who::Nobody, Who::Host, Who::Guest, Who::Both].map(|who| worst(who, 10, 30 * S));
-    assert!(all.iter().all(|(ratio, _)| *ratio <= MAX_SHOWN), "{all:?}");
+    check(10, 30 * S);
 }
 
 /// The same at length, run by hand.
 #[test]
 #[ignore = "takes minutes"]
 fn a_hundred_sessions_of_hitches_are_not_kicks() {
-    let all = [Who::Host, Who::Guest, Who::Both].map(|who| worst(who, 100, 60 * S));
-    assert!(all.iter().all(|(ratio, _)| *ratio <= MAX_SHOWN), "{all:?}");
+    check(100, 60 * S);
 }

@@ -11,6 +11,13 @@ const MAX_WAITING: usize = 64;
 const LONGEST_GAP: u32 = 8;
 /// Factor by which a correction fades per tick. After six ticks about a twentieth is left.
 const FADE: f64 = 0.6;
+/// Slowest hand that counts, as a share of the farthest that a hand may move in a tick, and factor
+/// by which the speed of a hand is forgotten per tick. A correction moves the hand no faster than
+/// the hand has moved of late.
+const SLOWEST: f64 = 0.01;
+const FORGETTING: f64 = 0.98;
+/// Largest factor by which the speed of a hand grows per tick.
+const GROWTH: f64 = 1.5;
 /// Factor by which an extrapolated hand slows down per tick while no target arrives.
 const SLOWING: f64 = 0.7;
 
@@ -20,7 +27,8 @@ const SLOWING: f64 = 0.7;
 /// are then still in time, and the hand repeats the guest's movement exactly, with that delay. The
 /// guest therefore recognizes its own targets in the frames, and knows how far ahead its hand is.
 /// If a target is missing during a movement, the hand goes on and slows down. The error of this
-/// extrapolation fades, like every jump, so that the hand does not jerk.
+/// extrapolation fades, like every jump, no faster than the hand has moved of late, so that the
+/// hand does not jerk.
 #[derive(Debug, Clone)]
 pub struct HandPlayout {
     queue: VecDeque<Vector3<f64>>,
@@ -35,6 +43,8 @@ pub struct HandPlayout {
     displayed: Vector3<f64>,
     /// Velocity of the hand, meters per tick.
     velocity: Vector3<f64>,
+    /// Largest speed of the received targets of late, meters per tick.
+    usual: f64,
 }
 
 impl HandPlayout {
@@ -49,6 +59,7 @@ impl HandPlayout {
             played: at,
             displayed: at,
             velocity: Vector3::zeros(),
+            usual: 0.0,
         }
     }
 
@@ -71,6 +82,7 @@ impl HandPlayout {
     /// and `most` is the farthest that the hand may move, m.
     pub fn next(&mut self, depth: usize, most: f64) -> Vector3<f64> {
         let expected = self.displayed + self.velocity;
+        self.usual = (self.usual * FORGETTING).clamp(SLOWEST * most, most);
         if !self.playing && !self.queue.is_empty() {
             if self.wait == 0 {
                 self.wait = depth.max(1);
@@ -85,14 +97,18 @@ impl HandPlayout {
             let skipped = if self.queue.len() > depth + 2 { self.queue.pop_front() } else { None };
             match self.queue.pop_front() {
                 Some(target) => {
-                    let follows = skipped.is_none() && !self.guessed;
+                    let way = target - skipped.unwrap_or(self.played);
+                    // A hand that has been out of touch jumps between two of its targets.
+                    let fastest = (GROWTH * self.usual).min(most);
+                    let jumps = way.norm() > fastest;
+                    let follows = skipped.is_none() && !self.guessed && !jumps;
                     let offset = if follows { self.displayed - self.played } else { expected - target };
-                    let before = skipped.unwrap_or(self.played);
                     if !self.guessed {
-                        self.velocity = target - before;
+                        self.velocity = way.cap_magnitude(fastest);
+                        self.usual = self.usual.max(self.velocity.norm());
                     }
                     (self.played, self.guessed) = (target, false);
-                    to = target + faded(offset, most);
+                    to = target + faded(offset, self.usual, most);
                 }
                 None => {
                     self.velocity *= SLOWING;
@@ -109,7 +125,7 @@ impl HandPlayout {
         if !self.playing {
             // A resting guest repeats its target only a few times, so the rest of a correction must
             // also fade without new targets.
-            to = self.played + faded(self.displayed - self.played, most);
+            to = self.played + faded(self.displayed - self.played, self.usual, most);
         }
         // The speed of the hand is limited, whatever the targets.
         let way = to - self.displayed;
@@ -118,11 +134,12 @@ impl HandPlayout {
     }
 }
 
-/// Returns the part of a correction that is left after a tick. A very small one becomes zero, so
-/// that the guest recognizes its own targets.
-fn faded(offset: Vector3<f64>, most: f64) -> Vector3<f64> {
-    let offset = offset * FADE;
-    if offset.norm() < 1e-4 * most { Vector3::zeros() } else { offset }
+/// Returns the part of a correction that is left after a tick in which the hand moves by at most
+/// `usual`. A very small part becomes zero, so that the guest recognizes its own targets.
+fn faded(offset: Vector3<f64>, usual: f64, most: f64) -> Vector3<f64> {
+    let size = offset.norm();
+    let left = (size * FADE).max(size - usual);
+    if left < 1e-4 * most { Vector3::zeros() } else { offset * (left / size) }
 }
 
 #[cfg(test)]
@@ -231,7 +248,8 @@ mod tests {
             hand.take(input, 1, end);
             hand.next(1, MAX);
         }
-        for _ in 0..40 {
+        // It is led there at the speed of a hand.
+        for _ in 0..80 {
             hand.next(1, MAX);
         }
         assert_eq!(hand.next(1, MAX), end);

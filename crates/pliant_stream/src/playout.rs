@@ -10,12 +10,19 @@ use crate::state::Tick;
 const WINDOW: usize = 128;
 /// Slew rate of the schedule toward the estimate, 1 %. Slewing keeps the change invisible.
 const SLEW: f64 = 0.01;
+/// Error that a hitch of the host, the network or this guest leaves, ticks. A guest that is ahead
+/// would show guesses, and waits at once. One that is behind runs after the schedule.
+const HITCH: f64 = 2.0;
+/// Speed of running after the schedule, on top of the normal one, and the error at which it ends,
+/// ticks.
+const RUN: f64 = 0.75;
+const CAUGHT_UP: f64 = 0.1;
 /// Error beyond which the estimate is adopted at once, s. It means that the path or the host's
 /// clock has jumped.
 const JUMP: f64 = 0.25;
 /// Number of consecutive frames later than `SHIFTED` ticks behind the line after which the line
 /// itself has moved, because the host paused.
-const LATE_ROW: usize = 8;
+pub(crate) const LATE_ROW: usize = 4;
 const SHIFTED: f64 = 3.0;
 /// Smallest and largest margin for scattered arrivals on top of a fixed delay, ticks.
 const MARGIN: f64 = 0.25;
@@ -35,6 +42,7 @@ pub struct PlayoutClock {
     samples: VecDeque<f64>,
     offset: Option<f64>,
     at: f64,
+    runs: bool,
     scratch: Vec<f64>,
 }
 
@@ -47,6 +55,7 @@ impl PlayoutClock {
             samples: VecDeque::with_capacity(WINDOW),
             offset: None,
             at: 0.0,
+            runs: false,
             scratch: Vec::new(),
         }
     }
@@ -72,8 +81,11 @@ impl PlayoutClock {
         let target = self.target();
         self.offset = Some(match self.offset {
             Some(old) if (target - old).abs() < JUMP => {
-                let room = SLEW * (now - self.at).clamp(0.0, 1.0);
-                old + (target - old).clamp(-room, room)
+                let ahead = (target - old) / self.h;
+                self.runs = ahead < -HITCH || (self.runs && ahead < -CAUGHT_UP);
+                let rate = if self.runs { RUN } else { SLEW };
+                let room = rate * (now - self.at).clamp(0.0, 1.0);
+                if ahead > HITCH { target } else { old + (target - old).clamp(-room, room) }
             }
             _ => target,
         });

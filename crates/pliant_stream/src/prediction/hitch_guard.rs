@@ -5,7 +5,8 @@
 //! within a tick, and the copy answers with a force that the body never gives, because the host
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
 //! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
-//! second. Where no frame comes at all, the reaction fades.
+//! second, until the host has the hand where this guest sent it. Where no frame comes at all, the
+//! reaction fades.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -19,6 +20,8 @@ use crate::state::Tick;
 const HITCH: Duration = Duration::from_millis(100);
 /// How long the bound applies after a hitch.
 const AFTER: Duration = Duration::from_secs(1);
+/// How long it applies at least after the host has found the hand again.
+const PROLONGED: Duration = Duration::from_millis(250);
 /// How far a reaction may exceed the largest that the body gave.
 const BEYOND: f64 = 1.2;
 /// Time constant with which a reaction fades where no frame comes, s.
@@ -77,6 +80,14 @@ impl HitchGuard {
         }
     }
 
+    /// Prolongs the bound after a hitch: the host does not yet have the hand where the guest sent
+    /// it, so the copy cannot know the reaction.
+    pub(crate) fn prolong(&mut self, now: Duration) {
+        if now < self.bounded_until {
+            self.bounded_until = self.bounded_until.max(now + PROLONGED);
+        }
+    }
+
     /// Returns what a hand is told of a reaction, N.
     pub(crate) fn bound(&self, reaction: [f64; 3]) -> [f64; 3] {
         let reaction = Vector3::from(reaction) * self.share;
@@ -112,6 +123,20 @@ mod tests {
         // Only what was given in the last second counts.
         let given: Vec<Tick> = guard.given.iter().map(|g| g.0).collect();
         assert!(given[0] == 40 && given.len() == 41, "{given:?}");
+    }
+
+    #[test]
+    fn the_bound_lasts_until_the_host_has_found_the_hand() {
+        let mut guard = HitchGuard::new(0.025);
+        guard.give(1, 1.0);
+        guard.pass(Duration::ZERO, Duration::ZERO);
+        guard.prolong(Duration::ZERO);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "without a hitch, nothing is prolonged");
+        for k in 5..=165 {
+            guard.pass(25 * k * MS, Duration::ZERO);
+            guard.prolong(25 * k * MS);
+            assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2, "{k}");
+        }
     }
 
     #[test]

@@ -65,6 +65,7 @@ pub struct PredictedHand {
     grabs: Vec<PredictedGrab>,
     lead: usize,
     votes: u32,
+    astray: bool,
     tick: Tick,
     active: bool,
     copy: BodyCopy,
@@ -92,6 +93,7 @@ impl PredictedHand {
             grabs: Vec::new(),
             lead: 0,
             votes: 0,
+            astray: false,
             tick: 0,
             active: false,
             copy: BodyCopy::new(rest.clone()),
@@ -174,6 +176,12 @@ impl PredictedHand {
     pub fn reaction(&self, grab: u16) -> Option<[f64; 3]> {
         let g = self.grabs.iter().find(|g| g.grab == grab && g.target.is_some())?;
         Some(std::array::from_fn(|k| g.reaction[k] + g.offset[k]))
+    }
+
+    /// Returns whether the host had a hand of this guest elsewhere than the guest sent it, at the
+    /// confirmed tick: it leads the hand back after a hitch, or has lost targets.
+    pub(crate) fn is_astray(&self) -> bool {
+        self.astray
     }
 
     /// Returns false when the guest does not hold the body and no offset fades. The confirmed state
@@ -396,13 +404,16 @@ impl PredictedHand {
     /// tick shows.
     fn vote(&mut self, receiver: &Receiver, user: UserId) {
         let mut found = None;
+        self.astray = false;
         for g in &self.grabs {
             let key = GrabKey { user, grab: g.grab };
             let Some(echo) = receiver.grabs().iter().find(|x| x.key == key) else { continue };
             let lags = g.past.iter().rev().enumerate().filter(|(_, t)| {
                 t.is_some_and(|t| t.iter().zip(echo.target).all(|(a, b)| f64::from(*a as f32) == b))
             });
-            found = lags.map(|(lag, _)| lag).min_by_key(|lag| lag.abs_diff(self.lead)).or(found);
+            let lag = lags.map(|(lag, _)| lag).min_by_key(|lag| lag.abs_diff(self.lead));
+            self.astray |= lag != Some(self.lead);
+            found = lag.or(found);
         }
         match found {
             Some(lag) if lag != self.lead => {

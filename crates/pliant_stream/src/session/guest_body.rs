@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 use pliant_modal::{HeldShapes, ModalModel};
 
 use crate::newmark::Newmark;
-use crate::playout::PlayoutClock;
+use crate::playout::{LATE_ROW, PlayoutClock};
 use crate::prediction::{HitchGuard, PredictedHand, Ring};
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
@@ -22,6 +22,8 @@ const MAX_REQUESTS: u8 = 12;
 const REQUEST_WITHIN: u64 = 200;
 /// Backlog beyond which the receiver does not catch up tick by tick, ticks. A snapshot is faster.
 const CATCH_UP: u64 = 120;
+/// Silence after which the host may have paused.
+const QUIET: Duration = Duration::from_millis(100);
 
 #[derive(Debug, Clone, Copy, Default)]
 struct TickRequest {
@@ -47,6 +49,8 @@ pub struct StreamedBody {
     newmark: Newmark,
     waiting: Vec<TickFrame>,
     snapshot: Option<SnapshotBytes>,
+    /// Frames after a silence until the schedule knows whether the host has paused.
+    waits_for: usize,
     requests: Ring<TickRequest>,
     /// Ticks up to here need no NACK: they are known, or lie before the run or the snapshot.
     resolved: Tick,
@@ -80,6 +84,7 @@ impl StreamedBody {
             newmark,
             waiting: Vec::new(),
             snapshot: None,
+            waits_for: 0,
             requests: Ring::new(HISTORY),
             resolved: 0,
             resting: false,
@@ -283,6 +288,7 @@ impl StreamedBody {
     }
 
     pub(crate) fn take_frame(&mut self, now: Duration, frame: TickFrame) {
+        let quiet = now.saturating_sub(self.received_at);
         self.received_at = now;
         let highest = self.receiver.as_ref().map_or(0, |r| r.history().highest());
         let modes = self.receiver.as_ref().map_or(0, |r| r.confirmed().modes());
@@ -308,6 +314,8 @@ impl StreamedBody {
         }
         if !frame.resent && frame.tick > highest {
             self.playout.arrived(now, frame.tick);
+            let stands = matches!(self.config.policy, Policy::ForceDriven { .. }) && quiet > QUIET;
+            self.waits_for = if stands { LATE_ROW } else { self.waits_for.saturating_sub(1) };
         }
         let before_run = frame.tick.saturating_sub(u64::from(frame.run) + 1);
         if frame.run < u16::MAX && before_run > self.resolved {
@@ -323,6 +331,7 @@ impl StreamedBody {
 
     /// Steps to all ticks that are due by now. Returns the number of ticks.
     pub(crate) fn advance(&mut self, now: Duration, user: UserId, round_trip: Duration) -> u64 {
+        let guesses = self.guesses();
         let Some(receiver) = &mut self.receiver else { return 0 };
         let quiet = if self.resting { Duration::ZERO } else { now.saturating_sub(self.received_at) };
         self.hitches.pass(now, quiet);
@@ -337,12 +346,12 @@ impl StreamedBody {
         let quiet = quiet > self.config.stall_after;
         let highest = receiver.history().highest();
         self.stalled = quiet && receiver.tick() >= highest;
-        let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
+        let most = highest + guesses;
         let mut stepped = 0;
         while let Some(due) = self.playout.due(receiver.tick() + 1) {
             // Prediction never runs far beyond the newest received tick, whatever the schedule
             // says.
-            if due > now || (quiet && receiver.tick() >= highest) || receiver.tick() >= highest + guesses {
+            if due > now || (quiet && receiver.tick() >= highest) || receiver.tick() >= most {
                 break;
             }
             if receiver.tick() + CATCH_UP < highest {
@@ -351,20 +360,49 @@ impl StreamedBody {
             }
             receiver.advance();
             stepped += 1;
-            if receiver.history().known(receiver.tick()).is_some() {
-                let own = receiver.grabs().iter().filter(|g| g.key.user == user);
-                let norm = |g: &VisualGrab| Vector3::from(g.reaction).norm();
-                self.hitches.give(receiver.tick(), own.map(norm).fold(0.0, f64::max));
+            if let Some(data) = receiver.history().known(receiver.tick()) {
+                // What is shown may still contain the error of a prediction. This was sent.
+                let own = data.grabs.iter().filter(|g| g.state.key.user == user);
+                let reactions = own.map(|g| Vector3::from(g.state.reaction).norm());
+                self.hitches.give(receiver.tick(), reactions.fold(0.0, f64::max));
             }
             if let Some(predicted) = &mut self.predicted {
                 let way = round_trip.as_secs_f64() + self.playout.delay();
                 predicted.step(receiver, user, (way / self.newmark.h).ceil() as usize);
+                if predicted.is_astray() {
+                    self.hitches.prolong(now);
+                }
             }
         }
-        if self.config.snapshots && receiver.wants_snapshot() {
+        if stepped > 0 {
+            self.fade_at = now + Duration::from_secs_f64(self.newmark.h);
+        } else if now >= self.fade_at && receiver.is_fading() && self.pauses(now) {
+            // The schedule waits for a host that has paused. Corrections go on meanwhile.
+            if let Some(receiver) = &mut self.receiver {
+                receiver.fade();
+            }
+            self.fade_at = now + Duration::from_secs_f64(self.newmark.h);
+        }
+        if self.config.snapshots && self.receiver.as_ref().is_some_and(Receiver::wants_snapshot) {
             self.wants_snapshot = true;
         }
         stepped
+    }
+
+    /// Ticks that may be shown beyond the newest received one. After a pause of the host, there are
+    /// none until the schedule knows how long the pause was.
+    fn guesses(&self) -> u64 {
+        let most = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
+        if self.waits_for > 0 { 0 } else { most }
+    }
+
+    /// Returns whether no tick is shown within the next step, because the schedule waits for the
+    /// host or no guess is allowed.
+    fn pauses(&self, now: Duration) -> bool {
+        let Some(receiver) = &self.receiver else { return false };
+        let soon = now + Duration::from_secs_f64(self.newmark.h);
+        receiver.tick() >= receiver.history().highest() + self.guesses()
+            || self.playout.due(receiver.tick() + 1).is_none_or(|due| due > soon)
     }
 
     /// Time at which the next tick is due.
@@ -374,12 +412,13 @@ impl StreamedBody {
             return receiver.is_fading().then_some(self.fade_at.max(now));
         }
         let highest = receiver.history().highest();
-        let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
         let waits = self.wants_snapshot && receiver.tick() + CATCH_UP < highest;
-        if self.stalled || waits || receiver.tick() >= highest + guesses {
-            return None;
+        let fades = (receiver.is_fading() && self.pauses(now)).then_some(self.fade_at.max(now));
+        if self.stalled || waits || receiver.tick() >= highest + self.guesses() {
+            return fades;
         }
-        self.playout.due(receiver.tick() + 1).map(|t| t.max(now))
+        let due = self.playout.due(receiver.tick() + 1).map(|t| t.max(now));
+        due.map(|due| fades.map_or(due, |fades| due.min(fades)))
     }
 
     /// Returns true, at most once a second, when a snapshot is to be requested.
