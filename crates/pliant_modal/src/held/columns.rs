@@ -113,6 +113,9 @@ impl Columns {
             let own: Vec<&GuidedShape> =
                 guided.iter().filter(|(patch, _)| *patch == index).map(|(_, shape)| shape).collect();
             let cases = own.len();
+            if cases == 0 {
+                continue;
+            }
             let forces: Vec<Vector3<f64>> = own.iter().map(|shape| shape.force).collect();
             let mut given = vec![0.0; 3 * region.node_count() * cases];
             for (case, shape) in own.iter().enumerate() {
@@ -120,7 +123,7 @@ impl Columns {
                 let mut q = q.to_vec();
                 self.less_part(s, &mut q);
                 let u = region.displacements(&q, &self.values, s);
-                given.iter_mut().skip(case).step_by(cases.max(1)).zip(u).for_each(|(to, u)| *to = u);
+                given.iter_mut().skip(case).step_by(cases).zip(u).for_each(|(to, u)| *to = u);
             }
             let mut found = region.corrections(index, load, &forces, &given, law);
             // What matters is the share of a shape's energy that is corrected.
@@ -129,7 +132,7 @@ impl Columns {
                 .map(|shape| shape.q.iter().zip(&omega).map(|(q, omega)| (q * omega).powi(2)).sum::<f64>())
                 .map(|energy| if energy > 0.0 { 1.0 / energy.sqrt() } else { 0.0 })
                 .collect();
-            for row in found.chunks_exact_mut(cases.max(1)) {
+            for row in found.chunks_exact_mut(cases) {
                 row.iter_mut().zip(&scales).for_each(|(x, scale)| *x *= scale);
             }
             blocks.push((found, cases));
