@@ -16,9 +16,9 @@
 //! use of attachment modes in substructure coupling for dynamic analysis*, 1977). Together with the
 //! coordinates they get a cubature rule of their own.
 //!
-//! Where a hand pulls far, shapes of second order are not enough. Further columns are the corrections
-//! that a Newton step of the full elements makes to shapes in which the hands pull far along the
-//! axes.
+//! Where a hand pulls far, shapes of second order are not enough. Further columns are the
+//! corrections that a Newton step of the full elements makes to shapes in which the hands pull far
+//! along the axes.
 //!
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 
