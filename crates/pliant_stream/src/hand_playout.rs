@@ -82,7 +82,7 @@ impl HandPlayout {
     /// and `most` is the farthest that the hand may move, m.
     pub fn next(&mut self, depth: usize, most: f64) -> Vector3<f64> {
         let expected = self.displayed + self.velocity;
-        self.usual = (self.usual * FORGETTING).clamp(SLOWEST * most, most);
+        self.usual = (self.usual * FORGETTING).max(SLOWEST * most).min(most);
         if !self.playing && !self.queue.is_empty() {
             if self.wait == 0 {
                 self.wait = depth.max(1);
@@ -139,7 +139,7 @@ impl HandPlayout {
 fn faded(offset: Vector3<f64>, usual: f64, most: f64) -> Vector3<f64> {
     let size = offset.norm();
     let left = (size * FADE).max(size - usual);
-    if left < 1e-4 * most { Vector3::zeros() } else { offset * (left / size) }
+    if left > 1e-4 * most { offset * (left / size) } else { Vector3::zeros() }
 }
 
 #[cfg(test)]
@@ -253,6 +253,18 @@ mod tests {
             hand.next(1, MAX);
         }
         assert_eq!(hand.next(1, MAX), end);
+    }
+
+    #[test]
+    fn a_bound_of_zero_gives_no_infinity() {
+        let mut hand = HandPlayout::new(Vector3::zeros());
+        for input in 1..20 {
+            hand.take(input, 1, Vector3::y());
+            let at = hand.next(1, 0.0);
+            assert!(at.iter().all(|x| x.is_finite()), "{at}");
+        }
+        // No panic either where the bound is not a number.
+        hand.next(1, f64::NAN);
     }
 
     #[test]
