@@ -107,7 +107,7 @@ def main():
         if not any(row["scene"] == scene for row in rows):
             lines.append(f"| {scene}: {what} | {', '.join(features)} | {crates(features)} | not measured in this run |  |  |  |  |  |")
     lines += ["",
-              "*Crates*: packages in the dependency tree with the scene's features, our own among them. *Program*: optimised, stripped, with all of the engine that a windowed game has; the "
+              "*Crates*: packages in the dependency tree with the scene's features, our own among them. *Program*: optimized, stripped, with all of the engine that a windowed game has; the "
               "scene without a picture has the engine without a renderer." + (" The engine and all that is not ours were compiled once, with the features that the whole project asks of them; "
               "with the scene's own the programs may be smaller." if args.one_engine else ""), "",
               "*Frames* come sixty times a second and hold one step. There is no window and no graphics card: surfaces that a camera sees are written by the processor, and the engine's "

@@ -11,7 +11,7 @@ use std::{
 use clap::{Args, ValueEnum};
 use pliant_lab::LabError;
 use pliant_lab::experiment::{Experiment, Metrics};
-use pliant_modal::{Elasticity, Integrator, ModalModel, Relaxation};
+use pliant_modal::{Elasticity, ModalModel, Relaxation};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
@@ -199,19 +199,12 @@ fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Str
             if let (Some(ticks), Policy::Paper { blend_ticks, .. }) = (args.blend, &mut recovery.policy) {
                 *blend_ticks = ticks;
             }
-            // Streamed accelerations follow Newmark's formulas, so the host's integrator must
-            // follow them as well.
-            let integrator = match recovery.policy {
-                Policy::ForceDriven { .. } => Integrator::Exact,
-                _ => Integrator::GeneralizedAlpha { rho_inf: 0.5 },
-            };
-            experiment(args, model, link, recovery, integrator, step).run()?
+            experiment(args, model, link, recovery, step).run()?
         }
         NetTopology::P2p => {
             let repair = REPAIRS.iter().find(|(known, _)| *known == name).map(|(_, repair)| *repair);
             let repair = repair.ok_or_else(|| unknown(REPAIRS.map(|(name, _)| name).join(", ")))?;
-            experiment(args, model, link, RecoveryConfig::default(), Integrator::Exact, step)
-                .run_peers(repair)?
+            experiment(args, model, link, RecoveryConfig::default(), step).run_peers(repair)?
         }
     };
     Ok(StreamMetrics::new(name, &metrics))
@@ -222,7 +215,6 @@ fn experiment(
     model: &Arc<ModalModel>,
     link: LinkConfig,
     recovery: RecoveryConfig,
-    integrator: Integrator,
     step: Duration,
 ) -> Experiment {
     Experiment {
@@ -230,7 +222,6 @@ fn experiment(
         seconds: args.seconds,
         seed: args.seed,
         elasticity: args.elasticity,
-        integrator,
         resend_after: step * args.resend_after,
         relaxation: args.relax,
         cpu_clock: Some(clock),

@@ -48,3 +48,9 @@ pub mod stability;
 
 pub use error::LabError;
 pub use progress::Progress;
+
+/// A ramp from 0 to 1 for `t` from 0 to 1, with zero speed and acceleration at both ends.
+pub(crate) fn smooth(t: f64) -> f64 {
+    let t = t.clamp(0.0, 1.0);
+    t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+}

@@ -14,7 +14,7 @@ use pliant_modal::{Integrator, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::peer::LateInputRepair;
 use pliant_stream::wire::AccelerationCoding;
-use pliant_stream::{Newmark, Policy, Predict, RecoveryConfig};
+use pliant_stream::{Newmark, Predict, RecoveryConfig};
 use support::bar;
 
 fn paper1(loss: Loss) -> LinkConfig {
@@ -57,11 +57,6 @@ fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Metrics {
     let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::by_name(policy).unwrap());
     (e.seconds, e.seed) = (seconds, seed);
     e.cpu_clock = Some(clock);
-    if !matches!(e.recovery.policy, Policy::ForceDriven { .. }) {
-        // The streamed and predicted accelerations follow Newmark's formulas, so a fair comparison
-        // with the paper needs such a host.
-        e.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
-    }
     e.run().unwrap()
 }
 

@@ -7,28 +7,21 @@ mod support;
 use std::time::Duration;
 
 use pliant_lab::experiment::Experiment;
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Patch, Relaxation};
 use pliant_stream::codec::encoder::Encoder;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::peer::LateInputRepair;
 use pliant_stream::recovery::Receiver;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
-    BodyId, GrabKey, GrabState, GuestSessionConfig, HostSessionConfig, Newmark, Policy, RecoveryConfig,
-    State, StepSettings, TickState, UserId,
+    BodyId, GrabKey, GrabState, GuestSessionConfig, HostSessionConfig, Newmark, RecoveryConfig, State,
+    StepSettings, TickState, UserId,
 };
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
 
 const MATERIAL: Relaxation = Relaxation { ratio: 0.6, time: 0.5 };
 const H: f64 = 0.025;
-
-fn integrator_for(recovery: &RecoveryConfig) -> Integrator {
-    match recovery.policy {
-        Policy::ForceDriven { .. } => Integrator::Exact,
-        _ => Integrator::GeneralizedAlpha { rho_inf: 0.5 },
-    }
-}
 
 #[test]
 fn every_policy_streams_a_relaxing_body_as_well_as_an_elastic_one() {
@@ -42,7 +35,7 @@ fn every_policy_streams_a_relaxing_body_as_well_as_an_elastic_one() {
                 ..LinkConfig::preset(Preset::Paper1)
             };
             let mut e = Experiment::new(bar(40, 0.05), link, recovery);
-            (e.seconds, e.relaxation, e.integrator) = (14.0, relaxation, integrator_for(&recovery));
+            (e.seconds, e.relaxation) = (14.0, relaxation);
             e.run().unwrap()
         };
         let (elastic, relaxing) = (run(None), run(Some(MATERIAL)));
@@ -85,7 +78,7 @@ fn peers_step_a_relaxing_body_together() {
 /// of the shape and of the viscoelastic state.
 fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let model = bar(24, 0.05);
-    let integrator = integrator_for(recovery);
+    let integrator = recovery.integrator();
     let settings = StepSettings { integrator, relaxation: Some(MATERIAL), ..Default::default() };
     let config = BodyConfig {
         step: H,

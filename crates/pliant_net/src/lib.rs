@@ -64,7 +64,7 @@ mod phase;
 mod plugin;
 mod recording;
 mod remote;
-mod retry_pause;
+mod retry;
 mod roster;
 mod session_transform;
 mod shared_body;

@@ -1,7 +1,9 @@
 //! The app's own grabs on bodies that a session steps, alike on a guest and a peer.
 
+use std::collections::BTreeMap;
+
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, VisualState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
 use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::{BodyId, StreamError};
 
@@ -33,7 +35,7 @@ impl OwnGrab {
         if let Err(error) = &begun {
             debug!("a grab was not taken: {error}");
         }
-        let point = PatchPoint::new(model, vertex, radius).ok();
+        let point = PatchPoint::new(model, vertex, radius);
         Self { body, vertex, radius, hold, number: begun.ok(), point }
     }
 
@@ -61,6 +63,57 @@ impl OwnGrab {
             GrabForce { force: new.force.clamp_length_max(most), ..new }
         });
         force.set_if_neq(new.unwrap_or_default());
+    }
+}
+
+impl AsRef<Self> for OwnGrab {
+    fn as_ref(&self) -> &Self {
+        self
+    }
+}
+
+/// A session that the app's own grabs are sent to.
+pub(crate) trait HandSession {
+    /// What is kept of a grab.
+    type Sent: AsRef<OwnGrab>;
+
+    /// Begins a grab with its target in session coordinates.
+    fn begin(&mut self, body: BodyId, grab: &Grab, model: &ModalModel, target: [f64; 3]) -> Self::Sent;
+
+    /// Moves a hand to a target in session coordinates.
+    fn lead(&mut self, sent: &mut Self::Sent, target: [f64; 3]);
+
+    /// Ends a grab.
+    fn end(&mut self, number: u16);
+}
+
+/// Sends the app's own grabs on the session's bodies: begins those that are new, moves those that
+/// were `sent`, and ends those that hold something else or nothing.
+pub(crate) fn send_grabs<'a, S: HandSession>(
+    session: &mut S,
+    sent: &mut BTreeMap<Entity, S::Sent>,
+    grabs: &Query<(Entity, &Grab, &GrabOf)>,
+    body_of: impl Fn(Entity) -> Option<(BodyId, &'a BodyState, &'a GlobalTransform)>,
+) {
+    sent.retain(|&entity, sent| {
+        let own = sent.as_ref();
+        let stays =
+            grabs.get(entity).is_ok_and(|(_, grab, of)| own.is(grab, body_of(of.0).map(|(body, ..)| body)));
+        if let (false, Some(number)) = (stays, own.number) {
+            session.end(number);
+        }
+        stays
+    });
+    for (entity, grab, of) in grabs {
+        let Some((body, state, transform)) = body_of(of.0) else { continue };
+        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
+        let target = place.point_to_session(grab.target);
+        match sent.get_mut(&entity) {
+            Some(sent) => session.lead(sent, target),
+            None => {
+                sent.insert(entity, session.begin(body, grab, state.model(), target));
+            }
+        }
     }
 }
 

@@ -45,7 +45,7 @@ pub struct Experiment {
     pub modes: Option<u16>,
     /// How the body resists deformation. Default: linear.
     pub elasticity: Elasticity,
-    /// The host's integrator. Default: exact.
+    /// The host's integrator. Default: [`RecoveryConfig::integrator`].
     pub integrator: Integrator,
     /// Relaxation of the material. Default: none, elastic.
     pub relaxation: Option<Relaxation>,
@@ -189,7 +189,7 @@ impl Experiment {
             seed: 1,
             modes: None,
             elasticity: Elasticity::default(),
-            integrator: Integrator::default(),
+            integrator: recovery.integrator(),
             relaxation: None,
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
             resend_after: Duration::ZERO,

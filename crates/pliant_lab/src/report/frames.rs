@@ -3,9 +3,9 @@
 use std::fmt::Write;
 
 use pliant_mesh::shapes;
-use pliant_modal::{Element, Integrator};
+use pliant_modal::Element;
 use pliant_stream::{
-    Policy, RecoveryConfig,
+    RecoveryConfig,
     emulator::{LinkConfig, Preset},
 };
 
@@ -26,11 +26,7 @@ const RATE: f64 = 40.0;
 fn experiment(modes: usize, link: LinkConfig, recovery: RecoveryConfig) -> Result<Experiment, LabError> {
     let mesh = shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?;
     let (model, _) = baked(&mesh, &config(Element::Tet10, modes, vec![anchor(0, 1e-9)]))?;
-    let mut made = Experiment::new(model, link, recovery);
-    if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
-        made.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
-    }
-    Ok(made)
+    Ok(Experiment::new(model, link, recovery))
 }
 
 fn bytes_a_tick(kbit_s: f64) -> f64 {

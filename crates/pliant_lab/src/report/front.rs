@@ -7,12 +7,12 @@ use pliant_modal::{
     Body, BodyConfig, Element, GrabConfig, Integrator, ModalModel, Patch, Precision, StepSettings,
 };
 use pliant_stream::{
-    Policy, RecoveryConfig,
+    RecoveryConfig,
     emulator::{LinkConfig, Preset},
 };
 
 use super::{
-    physics::{figure, smooth},
+    physics::figure,
     plot::{Figure, Series},
     work::{anchor, baked, config},
 };
@@ -64,7 +64,7 @@ fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Resu
     for i in 1..=(SECONDS * PICTURES) as usize * per {
         let t = i as f64 * step;
         let (sin, cos) = (std::f64::consts::TAU * 0.8 * t).sin_cos();
-        let s = 0.1 * smooth(t);
+        let s = 0.1 * crate::smooth(t);
         body.set_target(grab, [start[0], start[1] + s * cos, start[2] + 0.6 * s * sin])?;
         let began = Instant::now();
         body.step()?;
@@ -370,9 +370,6 @@ fn over_network(quick: bool, progress: &mut dyn Progress) -> Result<(Figure, Str
         let recovery = RecoveryConfig::by_name(name).unwrap_or_default();
         for &power in powers {
             let mut made = Experiment::new(model.clone(), LinkConfig::preset(Preset::Paper1), recovery);
-            if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
-                made.integrator = ALPHA;
-            }
             made.seconds = if quick { 20.0 } else { 60.0 };
             made.quantum = 2.0f64.powi(-power);
             let f = made.run()?;

@@ -158,11 +158,6 @@ pub(super) fn figure(
     }
 }
 
-pub(super) fn smooth(t: f64) -> f64 {
-    let t = t.clamp(0.0, 1.0);
-    t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
-}
-
 /// The motion of a bar under a hand, sampled every 1/60 s.
 struct Track {
     /// Reactions, N.
@@ -181,7 +176,7 @@ fn dragged(model: &Arc<ModalModel>, config: BodyConfig) -> Result<Track, LabErro
     let start = body.grab_position(grab)?;
     let mut out = Track { force: Vec::new(), q: Vec::new() };
     for i in 1..=120 * per {
-        let s = 0.1 * smooth(i as f64 * step);
+        let s = 0.1 * crate::smooth(i as f64 * step);
         body.set_target(grab, [start[0], start[1] + s, start[2] - 0.5 * s])?;
         body.step()?;
         if i % per == 0 {

@@ -107,9 +107,6 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
         for preset in [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4] {
             progress.report("network", done as f64 / count);
             let mut experiment = Experiment::new(model.clone(), LinkConfig::preset(preset), recovery);
-            if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
-                experiment.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
-            }
             experiment.seconds = if quick { 20.0 } else { 60.0 };
             experiment.cpu_clock = Some(machine::thread_time);
             let run = || match between_peers {
@@ -359,10 +356,7 @@ fn setting(
     let (model, _) = baked(&mesh, &setting)?;
     let size = model.size();
     // The hand pulls where the first mode moves most, so that the body gives way.
-    let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();
-    let vertex = (0..model.surface().positions().len() as u32)
-        .max_by(|a, b| moves(*a).total_cmp(&moves(*b)))
-        .unwrap_or(0);
+    let vertex = Experiment::default_hands(&model)[0].vertex;
     let patch = Patch::around(model.surface(), vertex, 0.06 * size)?;
     let way: [f64; 3] = std::array::from_fn(|axis| f64::from(model.displacement_row(vertex, axis, 0)));
     let length = way.iter().map(|x| x * x).sum::<f64>().sqrt();

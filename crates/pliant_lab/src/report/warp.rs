@@ -7,7 +7,7 @@ use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{Body, BodyConfig, Element, GrabConfig, ModalModel, Patch, StepSettings};
 
 use super::{
-    physics::{figure, smooth},
+    physics::figure,
     plot::{Figure, Series},
     work::{anchor, apart, baked, config, farthest, time_us},
 };
@@ -41,7 +41,7 @@ pub(super) fn held_as(
     }
     // The targets move slowly, as a hand does.
     for i in 0..3_000 {
-        let s = smooth(f64::from(i) / 600.0);
+        let s = crate::smooth(f64::from(i) / 600.0);
         for (grab, start, moved) in &grabs {
             body.set_target(*grab, std::array::from_fn(|k| start[k] + s * moved[k]))?;
         }

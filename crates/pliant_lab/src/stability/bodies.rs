@@ -178,12 +178,6 @@ pub(super) fn static_pull(held: &HeldCase, away: [f64; 3]) -> Result<Vector3<f64
     Ok(whole.try_inverse().map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * Vector3::from(away)))
 }
 
-/// A ramp from 0 to 1 within a second, with zero speed and acceleration at both ends.
-pub(super) fn smooth(t: f64) -> f64 {
-    let t = t.clamp(0.0, 1.0);
-    t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
-}
-
 /// max |second difference of F| / max |F|: 4 for a force that flips its sign each step.
 pub(super) fn ringing(forces: &[Vector3<f64>]) -> f64 {
     let largest = forces.iter().fold(0.0f64, |m, f| m.max(f.norm()));

@@ -9,10 +9,7 @@ use pliant_haptics::{
 };
 use pliant_modal::{Body, BodyConfig, GrabConfig};
 
-use super::{
-    Bound, Case, CaseOutcome,
-    bodies::{BarBody, smooth},
-};
+use super::{Bound, Case, CaseOutcome, bodies::BarBody};
 use crate::LabError;
 
 /// Periods a second of the device loop.
@@ -195,7 +192,7 @@ fn drag(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result
     } else {
         let arm = scene.cycle.device().handle();
         for k in 1..=500 {
-            let s = smooth(f64::from(k) / 500.0);
+            let s = crate::smooth(f64::from(k) / 500.0);
             arm.set_target([0.02 * s, 0.02 * s, -0.01 * s]);
             scene.tick()?;
         }

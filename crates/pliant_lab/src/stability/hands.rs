@@ -6,7 +6,7 @@ use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch, Step
 
 use super::{
     Bound, Case, CaseOutcome,
-    bodies::{BarBody, HeldCase, compliance, modal_compliance, settling, smooth},
+    bodies::{BarBody, HeldCase, compliance, modal_compliance, settling},
     plain,
 };
 use crate::LabError;
@@ -188,7 +188,7 @@ fn twist(young: f64, corrections: u8) -> Result<CaseOutcome, LabError> {
     }
     let axis = Vector3::new(0.0, 0.1, 0.1);
     let turned = |start: &Vector3<f64>, i: usize| {
-        let angle = 2.0 * std::f64::consts::TAU * smooth(i as f64 / 600.0);
+        let angle = 2.0 * std::f64::consts::TAU * crate::smooth(i as f64 / 600.0);
         let (sin, cos) = angle.sin_cos();
         let arm = start - axis;
         Vector3::new(start.x, axis.y + cos * arm.y - sin * arm.z, axis.z + sin * arm.y + cos * arm.z)

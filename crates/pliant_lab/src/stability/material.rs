@@ -7,7 +7,7 @@ use pliant_modal::{BodyConfig, Element, GrabConfig, Integrator, Patch, StepSetti
 
 use super::{
     Bound, Case, CaseOutcome, Expected,
-    bodies::{BarBody, HeldCase, energy_growth, no_growth, ringing, settling, smooth, static_pull},
+    bodies::{BarBody, HeldCase, energy_growth, no_growth, ringing, settling, static_pull},
     plain,
 };
 use crate::LabError;
@@ -159,7 +159,7 @@ fn drag(bar: &BarBody, config: BodyConfig) -> Result<CaseOutcome, LabError> {
     let steps = (2.0 * seconds / step) as usize;
     let reach = 0.05 * bar.length;
     let away = move |i: usize| {
-        let s = smooth((i + 1) as f64 * step / seconds) * reach;
+        let s = crate::smooth((i + 1) as f64 * step / seconds) * reach;
         [0.2 * s, 0.8 * s, -0.5 * s]
     };
     let mut forces = Vec::with_capacity(steps);

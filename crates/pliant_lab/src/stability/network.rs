@@ -3,9 +3,8 @@
 
 use std::time::Duration;
 
-use pliant_modal::Integrator;
 use pliant_stream::{
-    Policy, RecoveryConfig,
+    RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
     peer::LateInputRepair,
 };
@@ -72,11 +71,6 @@ fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<
     let mut experiment = Experiment::new(model, link.clone(), recovery);
     experiment.rate = rate;
     experiment.seconds = if rate > 40.0 { 10.0 } else { 30.0 };
-    // Streamed accelerations follow Newmark's formulas, so the host's integrator must follow them
-    // as well.
-    if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
-        experiment.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
-    }
     Ok(experiment)
 }
 

@@ -123,17 +123,27 @@ impl StepSettings {
 
     /// Encodes the settings for digests. Equal settings give the same bytes on every machine.
     pub fn to_bytes(&self) -> Vec<u8> {
-        let Self { integrator, second_order, warp, corrections, gravity, .. } = *self;
+        // Each field is named, so that a new one cannot be forgotten here.
+        let Self {
+            integrator,
+            elasticity,
+            second_order,
+            warp,
+            corrections,
+            relaxation,
+            damping_scale,
+            stiffness_scale,
+            gravity,
+        } = *self;
         let (kind, rho_inf) = match integrator {
             Integrator::Exact => (0, 0.0),
             Integrator::Newmark => (1, 0.0),
             Integrator::GeneralizedAlpha { rho_inf } => (2, rho_inf),
         };
-        let (ratio, time) = self.relaxation.map_or((0.0, 0.0), |r| (r.ratio, r.time));
-        let numbers = [rho_inf, self.damping_scale, self.stiffness_scale, ratio, time];
-        let mut out =
-            vec![kind, second_order.into(), warp.into(), corrections, self.relaxation.is_some().into()];
-        out.push(match self.elasticity {
+        let (ratio, time) = relaxation.map_or((0.0, 0.0), |r| (r.ratio, r.time));
+        let numbers = [rho_inf, damping_scale, stiffness_scale, ratio, time];
+        let mut out = vec![kind, second_order.into(), warp.into(), corrections, relaxation.is_some().into()];
+        out.push(match elasticity {
             Elasticity::Linear => 0,
             Elasticity::Reduced => 1,
         });

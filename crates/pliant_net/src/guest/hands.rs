@@ -5,12 +5,12 @@ use std::time::Duration;
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabOf};
-use pliant_stream::BodyId;
+use pliant_modal::ModalModel;
+use pliant_stream::{BodyId, GuestSession};
 
 use super::NetGuest;
-use crate::own_grab::OwnGrab;
+use crate::own_grab::{HandSession, OwnGrab, send_grabs};
 use crate::remote::RemoteBody;
-use crate::session_transform::SessionTransform;
 
 /// A local grab and what of it was sent to the host.
 pub(super) struct SentGrab {
@@ -34,29 +34,40 @@ pub(crate) fn send_hands(
     let guest = &mut *guest;
     let now = guest.now();
     let Some(session) = guest.session.as_mut().filter(|session| session.user().is_some()) else { return };
-    guest.grabs.retain(|&entity, sent| {
-        let stays = grabs
-            .get(entity)
-            .is_ok_and(|(_, grab, of)| sent.own.is(grab, bodies.get(of.0).ok().map(|(body, ..)| body.0)));
-        if let (false, Some(number)) = (stays, sent.own.number) {
-            session.end_grab(number);
-        }
-        stays
-    });
-    for (entity, grab, of) in &grabs {
-        let Ok((body, state, transform)) = bodies.get(of.0) else { continue };
-        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
-        let target = place.point_to_session(grab.target);
-        match guest.grabs.get_mut(&entity) {
-            None => {
-                let own = OwnGrab::begin(body.0, grab, state.model(), |hold| {
-                    session.begin_grab(now, body.0, grab.vertex, grab.radius, target, hold)
-                });
-                let path = HandPath(VecDeque::from([(now, target)]));
-                guest.grabs.insert(entity, SentGrab { own, target, times: 0, path, tick: 0 });
-            }
-            Some(sent) => sent.path.push(now, target),
-        }
+    let body_of = |entity| bodies.get(entity).ok().map(|(body, state, transform)| (body.0, state, transform));
+    send_grabs(&mut GuestHands { session, now }, &mut guest.grabs, &grabs, body_of);
+}
+
+/// The session with the time of the frame.
+struct GuestHands<'a> {
+    session: &'a mut GuestSession,
+    now: Duration,
+}
+
+impl HandSession for GuestHands<'_> {
+    type Sent = SentGrab;
+
+    fn begin(&mut self, body: BodyId, grab: &Grab, model: &ModalModel, target: [f64; 3]) -> SentGrab {
+        let own = OwnGrab::begin(body, grab, model, |hold| {
+            self.session.begin_grab(self.now, body, grab.vertex, grab.radius, target, hold)
+        });
+        let path = HandPath(VecDeque::from([(self.now, target)]));
+        SentGrab { own, target, times: 0, path, tick: 0 }
+    }
+
+    /// The target is sent by [`NetGuest::advance`].
+    fn lead(&mut self, sent: &mut SentGrab, target: [f64; 3]) {
+        sent.path.push(self.now, target);
+    }
+
+    fn end(&mut self, number: u16) {
+        self.session.end_grab(number);
+    }
+}
+
+impl AsRef<OwnGrab> for SentGrab {
+    fn as_ref(&self) -> &OwnGrab {
+        &self.own
     }
 }
 
@@ -155,7 +166,7 @@ impl NetGuest {
     }
 }
 
-fn view_tick(session: &pliant_stream::GuestSession, body: BodyId) -> u64 {
+fn view_tick(session: &GuestSession, body: BodyId) -> u64 {
     session.body(body).map_or(0, pliant_stream::StreamedBody::tick)
 }
 

@@ -129,7 +129,7 @@ pub struct NetGuest {
     leaving: bool,
     /// Since when the cameras see less of a body than is requested.
     less_since: BTreeMap<BodyId, Duration>,
-    retry: session::Retry,
+    rejoin: session::Rejoin,
     scratch: Vec<f64>,
     ledger: Ledger,
     /// Received models that are being decoded.
@@ -163,7 +163,7 @@ impl NetGuest {
             advanced: Duration::ZERO,
             leaving: false,
             less_since: BTreeMap::new(),
-            retry: session::Retry::default(),
+            rejoin: session::Rejoin::default(),
             scratch: Vec::new(),
             ledger: Ledger::default(),
             being_read: Vec::new(),

@@ -12,30 +12,20 @@ use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, Use
 use super::source::Came;
 use super::{GuestState, NetGuest};
 use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
-use crate::retry_pause::retry_pause;
+use crate::retry::Retry;
 use crate::transport::{Endpoint, Fingerprint};
 use crate::user::shortened;
 
-/// When the guest tries to join again.
+/// What a guest remembers of earlier connections to its host.
 #[derive(Debug, Default)]
-pub(super) struct Retry {
-    /// Time at which the connection to the host was lost.
-    since: Option<Duration>,
-    /// Time of the next attempt. `None` while an attempt is under way or none is needed.
-    next: Option<Duration>,
-    pause: Duration,
-    /// Number of attempts since the connection was lost.
-    attempts: u32,
+pub(super) struct Rejoin {
+    retry: Retry,
     /// Whether the guest has been in the session before.
     was_in: bool,
     /// Bodies that have not arrived again by this time are removed.
     orphans_until: Option<Duration>,
 }
 
-/// The first attempt follows after about `FIRST_PAUSE`. The pause doubles with each attempt, up to
-/// this length, and is half to one and a half times as long as that.
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
 /// How long after the welcome a body may take to arrive again, before it is removed.
 const ORPHANS: Duration = Duration::from_secs(5);
 
@@ -81,7 +71,7 @@ pub(crate) fn receive(world: &mut World) {
         let now = guest.now();
         guest.take_models();
         guest.take_events(world);
-        guest.try_again(world, now);
+        guest.reconnect(world, now);
         guest.flush();
     });
 }
@@ -143,16 +133,15 @@ impl NetGuest {
 
     /// Handles the end of a connection, or a failed attempt.
     fn ended(&mut self, world: &mut World, now: Duration, reason: DisconnectReason) {
-        use DisconnectReason::{Full, Left, Lost, Silent, UnknownHost, Unread};
         if matches!(self.state, GuestState::Closed { .. }) {
             return;
         }
         let may_come_back = match reason {
             // A host that has left may start again.
-            Left | Silent | Lost | Unread | UnknownHost => true,
+            DisconnectReason::Left => true,
             // A guest that was in the session may find a free place later.
-            Full => self.retry.was_in,
-            _ => false,
+            DisconnectReason::Full => self.rejoin.was_in,
+            reason => reason.is_loss(),
         };
         if may_come_back && !self.source.is_replay() {
             self.lost(world, now, reason);
@@ -163,16 +152,10 @@ impl NetGuest {
 
     /// Stops the bodies and schedules the next attempt to join, when the host is lost.
     fn lost(&mut self, world: &mut World, now: Duration, reason: DisconnectReason) {
-        self.retry.orphans_until = None;
-        let since = *self.retry.since.get_or_insert(now);
-        if now.saturating_sub(since) >= self.config.rejoin {
+        self.rejoin.orphans_until = None;
+        let key = self.source.endpoint().map_or(Fingerprint([0; 32]), Endpoint::fingerprint);
+        if !self.rejoin.retry.schedule(now, self.config.rejoin, key) {
             return self.close(world, reason);
-        }
-        if self.retry.next.is_none() {
-            self.retry.pause = (self.retry.pause * 2).clamp(FIRST_PAUSE, LONGEST_PAUSE);
-            self.retry.attempts += 1;
-            let key = self.source.endpoint().map_or(Fingerprint([0; 32]), Endpoint::fingerprint);
-            self.retry.next = Some(now + retry_pause(self.retry.pause, key, self.retry.attempts));
         }
         self.flush();
         self.end_session();
@@ -187,15 +170,14 @@ impl NetGuest {
         self.state = GuestState::Lost { reason };
     }
 
-    fn try_again(&mut self, world: &mut World, now: Duration) {
-        if self.retry.next.is_some_and(|due| now >= due) {
-            self.retry.next = None;
+    fn reconnect(&mut self, world: &mut World, now: Duration) {
+        if self.rejoin.retry.is_due(now) {
             self.source.rejoin();
         }
         // While the connection is lost, nothing says that the host has removed its bodies.
         let inside = matches!(self.state, GuestState::In { .. });
-        if inside && self.retry.orphans_until.is_some_and(|until| now >= until) {
-            self.retry.orphans_until = None;
+        if inside && self.rejoin.orphans_until.is_some_and(|until| now >= until) {
+            self.rejoin.orphans_until = None;
             self.forget_orphans(world);
         }
     }
@@ -259,9 +241,9 @@ impl NetGuest {
 
     fn welcomed(&mut self, world: &mut World, user: UserId) {
         let reconnected =
-            std::mem::replace(&mut self.retry, Retry { was_in: true, ..Retry::default() }).was_in;
+            std::mem::replace(&mut self.rejoin, Rejoin { was_in: true, ..Rejoin::default() }).was_in;
         if reconnected {
-            self.retry.orphans_until = Some(self.now() + ORPHANS);
+            self.rejoin.orphans_until = Some(self.now() + ORPHANS);
         }
         self.state = GuestState::In { user };
         let name = shortened(&self.config.name);

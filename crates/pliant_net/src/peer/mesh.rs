@@ -9,7 +9,7 @@ use pliant_stream::peer::PeerEvent;
 use pliant_stream::wire::PeerMessage;
 use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
 
-use super::reconnect::is_loss;
+use super::reconnect::may_come_back;
 use super::{NetPeer, PeerState};
 use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{Endpoint, Event, Fingerprint, Invite, Role};
@@ -61,6 +61,7 @@ pub(crate) fn receive(world: &mut World) {
             net.take_events(world);
         }
         net.take_events(world);
+        net.measure_paths();
         net.hang_up_on_the_silent();
         net.ending.retain(|thread| !thread.is_finished());
         net.look_for_the_missed();
@@ -273,12 +274,24 @@ impl NetPeer {
         }
     }
 
+    /// Tells the session how large the datagrams of each path may be, which QUIC finds out while it
+    /// runs.
+    fn measure_paths(&mut self) {
+        let size = |&peer: &PeerId| {
+            let (endpoint, number) = self.way(peer);
+            Some((peer, endpoint.max_datagram_size(number)?))
+        };
+        let sizes: Vec<(PeerId, usize)> = self.others.keys().filter_map(size).collect();
+        let Some(session) = &mut self.session else { return };
+        sizes.into_iter().for_each(|(peer, bytes)| session.set_max_datagram(peer, bytes));
+    }
+
     fn hang_up(&mut self, peer: PeerId, reason: DisconnectReason) {
         debug!("peer {peer} is sent away: {reason}");
         if let Some(other) = self.others.get_mut(&peer) {
             (other.sent_away, other.first) = (true, None);
             let key = other.key;
-            if !is_loss(reason) {
+            if !may_come_back(reason) {
                 self.take_token(&key);
             }
         }
@@ -345,7 +358,7 @@ impl NetPeer {
                         if let Some(other) = self.others.get_mut(&peer) {
                             (other.number, other.invite, other.sent_away) = (None, None, true);
                             let key = other.key;
-                            if !is_loss(reason) && reason != DisconnectReason::Left {
+                            if !may_come_back(reason) && reason != DisconnectReason::Left {
                                 self.take_token(&key);
                             }
                         }

@@ -6,10 +6,11 @@ use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf};
 use pliant_modal::{Body, ModalModel};
-use pliant_stream::{GrabKey, StepSettings};
+use pliant_stream::peer::PeerSession;
+use pliant_stream::{BodyId, GrabKey, StepSettings};
 
 use super::{NetPeer, PeerState};
-use crate::own_grab::OwnGrab;
+use crate::own_grab::{HandSession, OwnGrab, send_grabs};
 use crate::session_transform::SessionTransform;
 use crate::view::{BodyDisplay, DisplayedBodies, remote_hands};
 
@@ -56,32 +57,31 @@ pub(crate) fn send_hands(
         return;
     }
     let Some(session) = &mut net.session else { return };
-    let number_of =
-        |entity: Entity| net.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id);
-    net.grabs.retain(|&entity, sent| {
-        let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| sent.is(grab, number_of(of.0)));
-        if let (false, Some(number)) = (stays, sent.number) {
-            session.end_grab(number);
+    let body_of = |entity: Entity| {
+        let (state, transform) = bodies.get(entity).ok()?;
+        let (&id, _) = net.bodies.iter().find(|(_, played)| played.entity == entity)?;
+        Some((id, state, transform))
+    };
+    send_grabs(session, &mut net.grabs, &grabs, body_of);
+}
+
+impl HandSession for PeerSession {
+    type Sent = OwnGrab;
+
+    fn begin(&mut self, body: BodyId, grab: &Grab, model: &ModalModel, target: [f64; 3]) -> OwnGrab {
+        OwnGrab::begin(body, grab, model, |hold| {
+            self.begin_grab(body, grab.vertex, grab.radius, target, hold)
+        })
+    }
+
+    fn lead(&mut self, sent: &mut OwnGrab, target: [f64; 3]) {
+        if let Some(Err(error)) = sent.number.map(|number| self.set_target(number, target)) {
+            debug!("a target was not taken: {error}");
         }
-        stays
-    });
-    for (entity, grab, of) in &grabs {
-        let (Some(id), Ok((state, transform))) = (number_of(of.0), bodies.get(of.0)) else { continue };
-        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
-        let target = place.point_to_session(grab.target);
-        match net.grabs.get(&entity) {
-            Some(sent) => {
-                if let Some(Err(error)) = sent.number.map(|number| session.set_target(number, target)) {
-                    debug!("a target was not taken: {error}");
-                }
-            }
-            None => {
-                let own = OwnGrab::begin(id, grab, state.model(), |hold| {
-                    session.begin_grab(id, grab.vertex, grab.radius, target, hold)
-                });
-                net.grabs.insert(entity, own);
-            }
-        }
+    }
+
+    fn end(&mut self, number: u16) {
+        self.end_grab(number);
     }
 }
 

@@ -211,9 +211,9 @@ struct OutboxState {
     datagrams: VecDeque<Bytes>,
     messages: VecDeque<Bytes>,
     message_bytes: usize,
-    /// Code and text of the close, until the message writer takes them after the last message.
+    /// Reason of the close, until the message writer takes it after the last message.
     closing: Option<DisconnectReason>,
-    /// The same code and text, which stay set.
+    /// The same reason, which stays set.
     hung_up: Option<DisconnectReason>,
 }
 

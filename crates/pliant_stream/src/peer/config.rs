@@ -20,7 +20,7 @@ pub struct PeerSessionConfig {
     pub address: String,
     /// Length of a step, s. Default: 1/40.
     pub step: f64,
-    /// LateInputRepair of late inputs. Default: [`LateInputRepair::Rollback`].
+    /// Repair of late inputs. Default: [`LateInputRepair::Rollback`].
     pub repair: LateInputRepair,
     /// Number of ticks over which the visible error fades. Default: 6.
     pub blend_ticks: u16,

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::link::{Budget, Link, PatchBudget};
+use crate::link::{Budget, Link};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 
 /// Number of consecutive mismatches after which the other peer's state is taken.
@@ -44,15 +44,9 @@ pub(super) struct RemotePeer {
     pub(super) wants_state: bool,
     /// This peer has requested the other's state and has no answer yet.
     pub(super) asked_state: bool,
-    /// Budget of ticks that are sent again to the peer.
-    pub(super) answer_budget: Budget,
-    /// Budget of states that are sent to the peer.
-    pub(super) state_budget: Budget,
     /// Budget of what the peer's late inputs cost: for each tick that is stepped again, one and one
     /// for each hand.
     pub(super) late_budget: Budget,
-    /// Budget of the peer's new patches.
-    pub(super) patch_budget: PatchBudget,
 }
 
 impl RemotePeer {
@@ -63,8 +57,12 @@ impl RemotePeer {
         max_datagram: usize,
         step: f64,
     ) -> Self {
+        let mut link = Link::new(peer, now, max_datagram);
+        // Inputs are the same for all bodies. A request for the whole window every 150 ms is 853
+        // ticks a second, and a well-behaved peer requests no more.
+        link.repeats = Budget::new(1000.0, 1000.0);
         Self {
-            link: Link::new(peer, now, max_datagram),
+            link,
             user: None,
             expected,
             greeted: false,
@@ -77,14 +75,9 @@ impl RemotePeer {
             lost: false,
             wants_state: false,
             asked_state: false,
-            // A request for the whole window every 150 ms is 853 ticks a second. A well-behaved
-            // peer requests no more.
-            answer_budget: Budget::new(1000.0, 1000.0),
-            state_budget: Budget::new(2.0, 16.0),
             // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
             // each tick, one with one hand may be 96 ticks late, and one with ten 17.
             late_budget: Budget::new(192.0 / step, 256.0),
-            patch_budget: PatchBudget::default(),
         }
     }
 

@@ -14,7 +14,7 @@ use super::inputs::{InputLog, WINDOW};
 use super::other::{Hello, RemotePeer};
 use crate::StreamError;
 use crate::link::Events;
-use crate::session::{DisconnectReason, LinkStats, Output};
+use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
 use crate::wire::{
     Datagram, HeldAt, InputTick, Inputs, MAX_ADDRESS, MAX_BODIES, MAX_HELD, MAX_NACK_RUN, MAX_NACK_RUNS,
@@ -162,7 +162,7 @@ impl PeerSession {
     ///
     /// # Errors
     /// Returns [`StreamError::Full`] beyond 64 peers and [`StreamError::Config`] for the number 0,
-    /// which no peer has, or this peer's own number.
+    /// which no peer has, this peer's own number, or datagrams of less than [`MIN_DATAGRAM`].
     pub fn connect(
         &mut self,
         now: Duration,
@@ -186,7 +186,8 @@ impl PeerSession {
     /// When there is no room, the oldest such connection without a hello is removed to make room.
     ///
     /// # Errors
-    /// Returns [`StreamError::Full`] beyond 64 peers.
+    /// Returns [`StreamError::Full`] beyond 64 peers and [`StreamError::Config`] for datagrams of
+    /// less than [`MIN_DATAGRAM`].
     pub fn accept(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
         self.add(now, peer, None, max_datagram)
     }
@@ -198,6 +199,10 @@ impl PeerSession {
         user: Option<UserId>,
         max_datagram: usize,
     ) -> Result<(), StreamError> {
+        if max_datagram < MIN_DATAGRAM {
+            let found = max_datagram.to_string();
+            return Err(StreamError::Config { what: "datagram size", found, expected: "at least 256 bytes" });
+        }
         if self.others.len() >= MAX_PEERS
             && let Some(silent) = self.others.iter().find(|(_, o)| o.is_silent()).map(|(p, _)| *p)
         {
@@ -208,6 +213,16 @@ impl PeerSession {
         }
         self.others.insert(peer, RemotePeer::new(peer, now, user, max_datagram, self.config.step));
         Ok(())
+    }
+
+    /// Sets a new datagram size of the path to a peer. A peer whose path carries less than
+    /// [`MIN_DATAGRAM`] is disconnected.
+    pub fn set_max_datagram(&mut self, peer: PeerId, bytes: usize) {
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        other.link.max_datagram = bytes;
+        if bytes < MIN_DATAGRAM {
+            self.turn_away(peer, DisconnectReason::SmallDatagrams);
+        }
     }
 
     /// Sends a hello, once for each connection.
@@ -540,7 +555,7 @@ impl PeerSession {
             .map(|(p, _)| *p)
             .collect();
         for peer in silent {
-            self.disconnect(peer, DisconnectReason::Silent);
+            self.turn_away(peer, DisconnectReason::Silent);
         }
         if !self.started {
             return 0;
@@ -565,9 +580,11 @@ impl PeerSession {
         stepped
     }
 
-    /// Latest time at which to call [`PeerSession::update`].
+    /// Latest time at which to call [`PeerSession::update`]. `None` when there is nothing to wait
+    /// for.
     pub fn next_wakeup(&self) -> Option<Duration> {
-        self.next_step.filter(|_| self.started)
+        let silent = self.others.values().map(|other| other.link.silent_at(self.config.idle_timeout));
+        self.next_step.filter(|_| self.started).into_iter().chain(silent).min()
     }
 
     /// Returns the next datagram or message to send.
@@ -648,7 +665,7 @@ impl PeerSession {
         let wanted = runs.iter().flat_map(|run| run.first..run.first + u64::from(run.count));
         let known = wanted.filter_map(|t| own.at(t)).take(WINDOW);
         let mut ticks: Vec<InputTick> =
-            known.take_while(|_| other.answer_budget.spend(now, 1.0)).cloned().collect();
+            known.take_while(|_| other.link.repeats.spend(now, 1.0)).cloned().collect();
         let limit = other.link.max_datagram;
         while !ticks.is_empty() {
             let mut count = ticks.len().min(MAX_TICKS);
@@ -750,7 +767,7 @@ fn affords(
     let cost = again * (1 + input.held.len() as u64);
     let patch = |held: &HeldAt| match bodies.get(&held.body) {
         Some(body) if !body.has_patch(held.vertex, held.radius) => {
-            other.patch_budget.spend(now, body.model(), held.vertex, held.radius)
+            other.link.patches.spend(now, body.model(), held.vertex, held.radius)
         }
         _ => true,
     };

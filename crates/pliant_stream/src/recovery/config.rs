@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use pliant_modal::Integrator;
+
 use crate::wire::{AccelerationCoding, Payload, StreamSubscription};
 use crate::{StreamError, state::MAX_MODES};
 
@@ -138,6 +140,16 @@ impl RecoveryConfig {
     /// The names that [`RecoveryConfig::by_name`] accepts.
     pub const NAMES: [&'static str; 7] =
         ["default", "none", "paper", "paper-zero", "paper-hold", "paper-repeats", "force-driven"];
+
+    /// The integrator with which the host steps a body that is streamed this way. Accelerations
+    /// that are streamed or predicted are read by Newmark's formulas, so the host's integrator has
+    /// to follow them as well.
+    pub fn integrator(&self) -> Integrator {
+        match self.policy {
+            Policy::ForceDriven { .. } => Integrator::Exact,
+            _ => Integrator::GeneralizedAlpha { rho_inf: 0.5 },
+        }
+    }
 
     /// The stream subscription that this configuration sends to the host's encoder. `modes` limits
     /// the number of modes.

@@ -100,6 +100,12 @@ impl DisconnectReason {
         Self::Unread,
     ];
 
+    /// Returns whether the ends have lost each other, and neither has sent the other away: nothing
+    /// arrived, the connection was lost, messages were not read in time, or a host did not answer.
+    pub fn is_loss(self) -> bool {
+        matches!(self, Self::Silent | Self::Lost | Self::Unread | Self::UnknownHost)
+    }
+
     /// Number of the reason on the wire.
     pub fn code(self) -> u8 {
         let known = Self::ON_THE_WIRE.contains(&self);

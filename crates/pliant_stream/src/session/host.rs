@@ -304,7 +304,7 @@ impl HostSession {
                 let streams = p.streaming.contains(&nack.body);
                 let runs = nack.runs.iter().filter(|_| streams);
                 for tick in runs.flat_map(|r| r.first..r.first + u64::from(r.count)) {
-                    if !p.nack_budget.spend(now, 1.0) {
+                    if !p.link.repeats.spend(now, 1.0) {
                         break;
                     }
                     // A tick that is already queued needs no second answer.
@@ -377,7 +377,7 @@ impl HostSession {
                     && !p.grabs.contains_key(&grab)
                     && model.is_some_and(|model| {
                         (vertex as usize) < model.surface().positions().len()
-                            && p.patch_budget.spend(now, model, vertex, radius)
+                            && p.link.patches.spend(now, model, vertex, radius)
                     });
                 if fits {
                     p.grabs.insert(grab, AnnouncedGrab { body, input: None });
@@ -394,7 +394,7 @@ impl HostSession {
             }
             (GuestMessage::SnapshotRequest { body }, Some(_)) => {
                 let body = BodyId(body);
-                if p.streaming.contains(&body) && p.snapshot_budget.spend(now, 1.0) {
+                if p.streaming.contains(&body) && p.link.states.spend(now, 1.0) {
                     self.send_snapshot(peer, body);
                 }
             }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::regulator::Regulator;
 use super::{DisconnectReason, Output};
-use crate::link::{Budget, Link, PatchBudget, micros};
+use crate::link::{Budget, Link, micros};
 use crate::state::{BodyId, PeerId, Role, Tick, UserId, UserInfo};
 use crate::wire::{Clock, Datagram, HostMessage, MAX_BODIES, StreamSubscription};
 
@@ -66,13 +66,9 @@ pub(crate) struct GuestPeer {
     pub(crate) model_budget: Budget,
     /// Bytes of messages that the transport has accepted and not sent, as last reported.
     pub(crate) unsent: usize,
-    pub(crate) nack_budget: Budget,
-    pub(crate) snapshot_budget: Budget,
     pub(crate) message_budget: Budget,
     /// Budget of new targets of hands.
     pub(crate) target_budget: Budget,
-    /// Budget for new grabs.
-    pub(crate) patch_budget: PatchBudget,
     /// Budget for changes of interest.
     pub(crate) interest_budget: Budget,
     pub(crate) regulator: Regulator,
@@ -97,15 +93,9 @@ impl GuestPeer {
             resends: VecDeque::new(),
             model_budget: Budget::new(model_rate, 64.0 * 1024.0),
             unsent: 0,
-            // A guest may request 4,000 ticks a second: this covers 60 Hz at full loss with every
-            // tick requested eight times, for several bodies at once. In one frame, it may request
-            // four bodies' whole past.
-            nack_budget: Budget::new(4000.0, 1024.0),
-            snapshot_budget: Budget::new(2.0, 16.0),
             message_budget: Budget::new(200.0, 400.0),
             // All hands that a guest may have, each moved 240 times a second.
             target_budget: Budget::new(MAX_GUEST_GRABS as f64 * 240.0, 1024.0),
-            patch_budget: PatchBudget::default(),
             // One for each of the most bodies that a session may have.
             interest_budget: Budget::new(100.0, MAX_BODIES as f64),
             regulator: Regulator::default(),

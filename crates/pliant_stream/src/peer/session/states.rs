@@ -98,7 +98,7 @@ impl PeerSession {
         for peer in wanting {
             let Some(other) = self.others.get_mut(&peer) else { continue };
             // A peer that asks too often waits.
-            if other.state_budget.spend(now, 1.0) {
+            if other.link.states.spend(now, 1.0) {
                 other.wants_state = false;
                 self.message(peer, &state);
             }
