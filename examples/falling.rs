@@ -1,5 +1,5 @@
-//! Soft jacks fall on a floor, a ball, a slope and a turning bar, and stay where friction holds
-//! them.
+//! Soft jacks fall on a floor, a ball, a slope, a turning bar and a ring of triangles, and stay
+//! where friction holds them.
 //!
 //! What to learn here: an [`Obstacle`] is one component with a `Transform`, and bodies touch it. It
 //! may move. [`BodyContacts`] on a body tells where it touches and with what force, and observers
@@ -80,8 +80,16 @@ fn place(
         Turning,
         Obstacle::Capsule { radius, half_length },
         Mesh3d(meshes.add(Capsule3d::new(radius, 2.0 * half_length))),
-        MeshMaterial3d(matte),
+        MeshMaterial3d(matte.clone()),
         Transform::from_xyz(0.0, 0.1, 0.45).with_rotation(lying),
+    ));
+    // Any mesh may be an obstacle, like one that was made in Blender.
+    let ring = meshes.add(Torus { minor_radius: 0.06, major_radius: 0.24 });
+    commands.spawn((
+        Obstacle::Mesh(ring.clone()),
+        Mesh3d(ring),
+        MeshMaterial3d(matte),
+        Transform::from_xyz(-0.2, 0.06, -0.5),
     ));
 }
 

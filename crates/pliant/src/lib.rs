@@ -25,7 +25,7 @@
 //! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | pointers drag bodies (feature `picking`) | only code makes grabs |
 #![cfg_attr(
     feature = "contact",
-    doc = "| [`ContactPlugin`](contact::ContactPlugin) | bodies touch floors, balls, boxes and capsules (feature `contact`) | bodies touch nothing |"
+    doc = "| [`ContactPlugin`](contact::ContactPlugin) | bodies touch floors, balls, boxes, capsules and meshes (feature `contact`) | bodies touch nothing |"
 )]
 #![cfg_attr(
     all(feature = "panel", feature = "rerun"),
@@ -64,6 +64,7 @@
 //! | `window` | yes | the usual parts of a windowed game: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
 //! | `wayland` | no | native Wayland windows (building needs the Wayland client headers) |
 //! | `contact` | yes | obstacles that bodies touch, and bodies that touch each other |
+//! | `contact-mesh` | yes | convex hulls and triangle meshes as obstacles |
 //! | `net` | yes | sessions over QUIC |
 //! | `haptics` | yes | haptic devices and the device loop |
 //! | `rerun` | yes | the client of the rerun viewer |
@@ -193,7 +194,7 @@ pub struct Readme;
     feature = "haptics",
     feature = "rerun",
     feature = "panel",
-    feature = "contact",
+    feature = "contact-mesh",
     feature = "bake"
 ))]
 pub mod book {

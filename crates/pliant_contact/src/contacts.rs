@@ -8,7 +8,7 @@ use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused, BodyState, Driven};
 use pliant_modal as modal;
 
-use crate::obstacle::{ContactLayers, Motion};
+use crate::obstacle::{ContactLayers, Motion, Nothing};
 
 /// Coefficient of Coulomb friction between a body and all obstacles, 0 to 10. Between two bodies
 /// the coefficient is the geometric mean of both.
@@ -108,16 +108,6 @@ pub(crate) struct Nearby {
     slots: Vec<Option<Entity>>,
     /// BodyFriction that was refused, so that it is told once.
     refused: Option<f64>,
-}
-
-/// Stands at the index of an obstacle that has left, so that the others keep theirs.
-#[derive(Debug)]
-struct Nothing;
-
-impl modal::ObstacleShape for Nothing {
-    fn at(&self, _: &Vector3<f64>) -> modal::SurfacePoint {
-        modal::SurfacePoint { distance: 1e30, normal: Vector3::y() }
-    }
 }
 
 /// Adds what a new body needs for its contacts.

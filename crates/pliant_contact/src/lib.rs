@@ -1,5 +1,5 @@
-//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes and capsules of a scene,
-//! and each other.
+//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes, capsules and meshes of
+//! a scene, and each other.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -40,6 +40,8 @@
 )]
 
 mod contacts;
+#[cfg(feature = "mesh")]
+mod mesh;
 mod obstacle;
 #[cfg(test)]
 mod tests;
@@ -76,6 +78,8 @@ impl Default for ContactPlugin {
 
 impl Plugin for ContactPlugin {
     fn build(&self, app: &mut App) {
+        #[cfg(feature = "mesh")]
+        app.init_resource::<mesh::Solids>();
         app.register_type::<Obstacle>()
             .register_type::<ContactLayers>()
             .register_type::<BodyFriction>()

@@ -1,5 +1,7 @@
 //! Obstacles as components, and their motion from tick to tick.
 
+#[cfg(feature = "mesh")]
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use bevy::{
@@ -10,6 +12,9 @@ use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused};
 use pliant_modal as modal;
 
+#[cfg(feature = "mesh")]
+use crate::mesh::{InWorldOf, Solid, Solids};
+
 /// A rigid shape that bodies touch, at the entity's `Transform`.
 ///
 /// The scale of the entity multiplies the shape. A ball and a capsule take the largest of the three
@@ -18,7 +23,7 @@ use pliant_modal as modal;
 /// An obstacle may move. Its velocity is its way since the last tick, so that it carries and pushes
 /// what it touches. Bodies do not push it back. A way faster than 100 m/s or 100 rad/s is a
 /// teleport without velocity.
-#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[derive(Component, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Component, Debug, Clone, PartialEq)]
 #[require(Transform)]
 pub enum Obstacle {
@@ -41,6 +46,15 @@ pub enum Obstacle {
         /// Half the distance of the centers of the two round ends, m.
         half_length: f32,
     },
+    /// The convex hull of a mesh. It touches nothing until the mesh is loaded, and a mesh that is
+    /// only in the render world is refused.
+    #[cfg(feature = "mesh")]
+    Hull(Handle<Mesh>),
+    /// The triangles of a mesh, solid on the side from which they are not seen. A closed mesh that
+    /// is inside out is turned. An open one, like a terrain, is solid below without end. It touches
+    /// nothing until the mesh is loaded, and a mesh that is only in the render world is refused.
+    #[cfg(feature = "mesh")]
+    Mesh(Handle<Mesh>),
 }
 
 /// Selects what touches what: a body and an obstacle touch if each one's filters have a bit of the
@@ -72,10 +86,30 @@ impl ContactLayers {
 const TELEPORT: f64 = 100.0;
 const TELEPORT_TURN: f64 = 100.0;
 
+/// The shape of an obstacle, as far as its component tells it, or its triangles.
+#[derive(Debug, Clone)]
+enum Shape {
+    Plain(Obstacle),
+    #[cfg(feature = "mesh")]
+    Solid(Arc<Solid>),
+}
+
+impl PartialEq for Shape {
+    fn eq(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Plain(a), Self::Plain(b)) => a == b,
+            #[cfg(feature = "mesh")]
+            (Self::Solid(a), Self::Solid(b)) => Arc::ptr_eq(a, b),
+            #[cfg(feature = "mesh")]
+            _ => false,
+        }
+    }
+}
+
 /// Pose and motion of an obstacle at this tick, world axes.
-#[derive(Component, Debug, Clone, Copy, PartialEq)]
+#[derive(Component, Debug, Clone, PartialEq)]
 pub(crate) struct Motion {
-    pub(crate) shape: Obstacle,
+    shape: Shape,
     /// Scale of the entity.
     scale: DVec3,
     position: DVec3,
@@ -94,13 +128,28 @@ fn spin(from: DQuat, to: DQuat, step: f64) -> DVec3 {
 }
 
 impl Motion {
-    fn new(shape: Obstacle, global: &GlobalTransform) -> Option<Self> {
+    /// `solid` gives the shape of a mesh at a scale, when it is known.
+    fn new(
+        shape: &Obstacle,
+        global: &GlobalTransform,
+        solid: impl FnOnce(DVec3) -> Option<Shape>,
+    ) -> Option<Self> {
         let (scale, rotation, position) = global.to_scale_rotation_translation();
         let sound = scale.is_finite() && rotation.is_finite() && position.is_finite();
-        sound.then(|| Self {
+        let (scale, position) = (scale.as_dvec3(), position.as_dvec3());
+        let shape = match shape {
+            _ if !sound => return None,
+            #[cfg(feature = "mesh")]
+            Obstacle::Hull(_) | Obstacle::Mesh(_) => solid(scale)?,
+            plain => {
+                let _ = solid;
+                Shape::Plain(plain.clone())
+            }
+        };
+        Some(Self {
             shape,
-            scale: scale.abs().as_dvec3(),
-            position: position.as_dvec3(),
+            scale: scale.abs(),
+            position,
             rotation: rotation.as_dquat().normalize(),
             velocity: DVec3::ZERO,
             spin: DVec3::ZERO,
@@ -116,7 +165,7 @@ impl Motion {
         if velocity.length() <= TELEPORT && spin.length() <= TELEPORT_TURN {
             (self.velocity, self.spin) = (velocity, spin);
         }
-        self.changed = Self { changed: last.changed, sound: last.sound, ..self } != *last;
+        self.changed = Self { changed: last.changed, sound: last.sound, ..self.clone() } != *last;
         self.sound = last.sound;
         self
     }
@@ -138,7 +187,17 @@ impl Motion {
     fn visit<V: Visit>(&self, scale: f64, visit: V) -> V::Output {
         let whole = self.scale.max_element() / scale;
         let center = [0.0; 3];
-        match self.shape {
+        let plain = match &self.shape {
+            Shape::Plain(plain) => plain,
+            #[cfg(feature = "mesh")]
+            Shape::Solid(solid) => {
+                return visit.visit(self.moving(InWorldOf { solid: solid.clone(), factor: scale }, scale));
+            }
+        };
+        match *plain {
+            // These have a solid instead.
+            #[cfg(feature = "mesh")]
+            Obstacle::Hull(_) | Obstacle::Mesh(_) => visit.visit(Nothing),
             Obstacle::Floor => visit.visit(self.moving(modal::Plane::GROUND, scale)),
             Obstacle::Ball { radius } => {
                 let radius = f64::from(radius) * whole;
@@ -196,9 +255,52 @@ impl Visit for Distance<'_> {
     }
 }
 
+/// Stands for an obstacle that is not there.
+#[derive(Debug)]
+pub(crate) struct Nothing;
+
+impl modal::ObstacleShape for Nothing {
+    fn at(&self, _: &Vector3<f64>) -> modal::SurfacePoint {
+        modal::SurfacePoint { distance: 1e30, normal: Vector3::y() }
+    }
+}
+
+/// Finds the triangles of obstacles that have some.
+#[cfg(feature = "mesh")]
+#[derive(bevy::ecs::system::SystemParam)]
+pub(crate) struct Meshes<'w, 's> {
+    solids: ResMut<'w, Solids>,
+    meshes: Option<Res<'w, Assets<Mesh>>>,
+    changes: Option<MessageReader<'w, 's, AssetEvent<Mesh>>>,
+}
+
+#[cfg(feature = "mesh")]
+impl Meshes<'_, '_> {
+    fn tidy(&mut self) {
+        let changed = self.changes.iter_mut().flat_map(MessageReader::read).filter_map(|event| match event {
+            AssetEvent::Modified { id } | AssetEvent::Removed { id } => Some(*id),
+            _ => None,
+        });
+        self.solids.tidy(changed);
+    }
+
+    /// Returns the shape of an obstacle at a scale, and the error of a mesh that cannot be one.
+    fn find(&mut self, obstacle: &Obstacle, scale: DVec3) -> Option<Result<Shape, modal::StepError>> {
+        let (mesh, hull) = match obstacle {
+            Obstacle::Hull(mesh) => (mesh, true),
+            Obstacle::Mesh(mesh) => (mesh, false),
+            _ => return None,
+        };
+        let found = self.solids.get(self.meshes.as_deref()?, mesh, hull, scale)?;
+        Some(found.map(Shape::Solid))
+    }
+}
+
 /// Takes the pose of every obstacle at this tick, and its motion since the last one.
 pub(crate) fn move_obstacles(
     time: Res<Time>,
+    #[cfg(feature = "mesh")] mut meshes: Meshes,
+    #[cfg(feature = "mesh")] mut unsound: Local<BTreeSet<Entity>>,
     mut commands: Commands,
     transforms: TransformHelper,
     mut refused: MessageWriter<BodyRefused>,
@@ -209,12 +311,33 @@ pub(crate) fn move_obstacles(
         commands.entity(entity).try_remove::<Motion>();
     }
     let step = time.delta_secs_f64();
-    for (entity, &shape, motion) in &mut obstacles {
+    #[cfg(feature = "mesh")]
+    {
+        meshes.tidy();
+        unsound.retain(|entity| obstacles.contains(*entity));
+    }
+    for (entity, shape, motion) in &mut obstacles {
         // `GlobalTransform` is that of the last frame.
         let global = transforms.compute_global_transform(entity).ok();
-        let mut now = global.and_then(|global| Motion::new(shape, &global));
+        #[cfg(feature = "mesh")]
+        let solid = |scale| match meshes.find(shape, scale)? {
+            Ok(solid) => {
+                unsound.remove(&entity);
+                Some(solid)
+            }
+            Err(error) => {
+                if unsound.insert(entity) {
+                    warn!("{entity}: {error}");
+                    refused.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+                }
+                None
+            }
+        };
+        #[cfg(not(feature = "mesh"))]
+        let solid = |_| None;
+        let mut now = global.and_then(|global| Motion::new(shape, &global, solid));
         if let (Some(now), Some(last)) = (&mut now, &motion) {
-            *now = now.after(last, step);
+            *now = now.clone().after(last, step);
         }
         if let Some(now) = now.as_mut().filter(|now| now.changed) {
             let before = motion.as_ref().is_none_or(|last| last.sound);

@@ -1,5 +1,8 @@
 //! A cube on obstacles in an app without a renderer, against what mechanics says.
 
+#[cfg(feature = "mesh")]
+mod mesh;
+
 use std::sync::{Arc, LazyLock};
 
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};

@@ -218,10 +218,15 @@ impl NetHost {
 
     /// Returns the session's key for a grab made at the host.
     fn own_key(&mut self, entity: Entity) -> GrabKey {
-        let next = &mut self.next_own_grab;
-        let grab = *self.own_grabs.entry(entity).or_insert_with(|| {
-            *next = next.wrapping_add(1);
-            *next
+        let grab = self.own_grabs.get(&entity).copied().unwrap_or_else(|| {
+            // The numbers wrap around, and a grab may be held for that long.
+            let used: BTreeSet<u16> = self.own_grabs.values().copied().collect();
+            let from = self.next_own_grab;
+            let mut all = (0..=u16::MAX).map(|k| from.wrapping_add(k));
+            let grab = all.find(|number| !used.contains(number)).unwrap_or(from);
+            self.next_own_grab = grab.wrapping_add(1);
+            self.own_grabs.insert(entity, grab);
+            grab
         });
         GrabKey { user: UserId::HOST, grab }
     }

@@ -15,7 +15,7 @@ use super::other::{Hello, RemotePeer};
 use crate::StreamError;
 use crate::link::Events;
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
-use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
+use crate::state::{BodyId, PeerId, Tick, UserId, in_range, next_free};
 use crate::wire::{
     Datagram, HeldAt, InputTick, Inputs, MAX_ADDRESS, MAX_BODIES, MAX_HELD, MAX_NACK_RUN, MAX_NACK_RUNS,
     MAX_NAME, MAX_PEERS, MAX_TICKS, NackRun, PROTOCOL_VERSION, PeerMessage, StateCheck, check_hold,
@@ -361,11 +361,7 @@ impl PeerSession {
         if self.own.len() >= MAX_HELD {
             return Err(StreamError::Full { what: "grabs", limit: MAX_HELD });
         }
-        while self.own.contains_key(&self.next_grab) {
-            self.next_grab = self.next_grab.wrapping_add(1);
-        }
-        let grab = self.next_grab;
-        self.next_grab = grab.wrapping_add(1);
+        let grab = next_free(&mut self.next_grab, |grab| !self.own.contains_key(&grab));
         self.own.insert(grab, HeldAt { body, grab, vertex, radius, target, hold }.rounded());
         Ok(grab)
     }

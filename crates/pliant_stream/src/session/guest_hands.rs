@@ -8,7 +8,7 @@ use pliant_modal::GrabConfig;
 use super::MIN_DATAGRAM;
 use super::guest::GuestSession;
 use crate::StreamError;
-use crate::state::{BodyId, in_range};
+use crate::state::{BodyId, in_range, next_free};
 use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets, check_hold};
 
 /// Interval at which an unchanged target is sent again.
@@ -71,11 +71,7 @@ impl GuestSession {
         if self.grabs.len() >= limit {
             return Err(StreamError::Full { what: "grabs", limit });
         }
-        while self.grabs.contains_key(&self.next_grab) {
-            self.next_grab = self.next_grab.wrapping_add(1);
-        }
-        let grab = self.next_grab;
-        self.next_grab = grab.wrapping_add(1);
+        let grab = next_free(&mut self.next_grab, |grab| !self.grabs.contains_key(&grab));
         self.grabs.insert(grab, LocalGrab { body, targets: VecDeque::new(), fresh: false, sent_at: now });
         if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
             predicted.begin(grab, vertex, radius, target, hold);

@@ -15,7 +15,9 @@ use crate::StreamError;
 use crate::codec::encoder::Encoder;
 use crate::link::Events;
 use crate::newmark::Newmark;
-use crate::state::{BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo};
+use crate::state::{
+    BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo, next_free,
+};
 use crate::wire::{
     BodyInfo, Datagram, GuestMessage, HostMessage, MAX_NAME, PROTOCOL_VERSION, StreamSubscription,
 };
@@ -465,18 +467,11 @@ impl HostSession {
     fn admit(&mut self, now: Duration, peer: PeerId, before: Option<UserId>, role: Role) {
         let taken: BTreeSet<u16> = self.peers.values().filter_map(|p| p.user().map(|u| u.0)).collect();
         let free = |number: u16| number != 0 && !taken.contains(&number);
-        let number = match before.map(|user| user.0).filter(|&number| free(number)) {
-            Some(number) => number,
-            None => {
-                // The search ends: there are at most 256 guests by default and 65,535 numbers.
-                let mut number = self.next_user;
-                while !free(number) {
-                    number = number.wrapping_add(1);
-                }
-                self.next_user = number.wrapping_add(1);
-                number
-            }
-        };
+        // There are fewer guests than numbers.
+        let number = before
+            .map(|user| user.0)
+            .filter(|&number| free(number))
+            .unwrap_or_else(|| next_free(&mut self.next_user, free));
         let user = UserId(number);
         let users = self.host_user.clone().into_iter().chain(self.peers.values().filter_map(GuestPeer::info));
         let users: Vec<UserInfo> = users.collect();
