@@ -5,8 +5,8 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, ObstacleShape,
-    Patch, Precision, State, StepError, StepReport, StepSettings,
+    Contacts, Frame, FrameMotion, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel,
+    ObstacleShape, Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
     step::{
         Six,
@@ -62,6 +62,8 @@ pub struct Body {
     pushes: Vec<f64>,
     push_force: Vector3<f64>,
     push_torque: Vector3<f64>,
+    /// Motion of the anchors over the next step.
+    motion: FrameMotion,
     /// The hands. `grabs` holds their identifiers in the same order.
     hands: Vec<Hand>,
     grabs: Vec<GrabEntry>,
@@ -104,6 +106,7 @@ impl Body {
             pushes: zero.clone(),
             push_force: Vector3::zeros(),
             push_torque: Vector3::zeros(),
+            motion: FrameMotion::default(),
             hands: Vec::new(),
             grabs: Vec::new(),
             next_grab: 1,
@@ -455,6 +458,24 @@ impl Body {
         Ok(())
     }
 
+    /// Lets the mass of an anchored body feel how its anchors move during the next step
+    /// ([`FrameMotion`]). [`Body::set_pose`] alone moves the anchors without that.
+    ///
+    /// For a step of second order these are the values in the middle of the step. A motion that
+    /// would leave the body behind by more than its size in one step counts as one that does not. A
+    /// free body ignores the motion, because its frame is its own.
+    ///
+    /// The first call finds the moments of the model, which takes some milliseconds.
+    ///
+    /// # Errors
+    /// Returns an error if a number is not finite. The motion then stays as it was.
+    pub fn set_frame_motion(&mut self, motion: FrameMotion) -> Result<(), StepError> {
+        motion.check()?;
+        self.kernel.prepare_motion();
+        self.motion = motion;
+        Ok(())
+    }
+
     /// Applies `impulse` (N s, world axes) to a surface vertex. Velocities change at once.
     ///
     /// # Errors
@@ -624,7 +645,7 @@ impl Body {
     /// Performs one step without other bodies, after [`Body::begin_step`].
     pub(crate) fn step_alone(&mut self) -> Result<StepReport, StepError> {
         let (force, torque) = (self.push_force, self.push_torque);
-        let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
+        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame_is_given: false };
         self.kernel.step_touching(&mut self.state, &mut self.hands, &load, &mut self.contacts)
     }
 
@@ -633,6 +654,7 @@ impl Body {
         self.pushes.fill(0.0);
         self.push_force = Vector3::zeros();
         self.push_torque = Vector3::zeros();
+        self.motion = FrameMotion::default();
     }
 
     pub(crate) fn contacts_mut(&mut self) -> &mut Contacts {
@@ -642,7 +664,7 @@ impl Body {
     /// What a step with others changes.
     pub(crate) fn parts<'a>(&'a mut self, report: &'a mut StepReport) -> Parts<'a> {
         let (force, torque) = (self.push_force, self.push_torque);
-        let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
+        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame_is_given: false };
         Parts {
             kernel: &mut self.kernel,
             state: &mut self.state,
@@ -656,7 +678,7 @@ impl Body {
     /// What a step with others reads.
     pub(crate) fn view(&self) -> View<'_> {
         let (force, torque) = (self.push_force, self.push_torque);
-        let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
+        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame_is_given: false };
         View { kernel: &self.kernel, state: &self.state, hands: &self.hands, load, contacts: &self.contacts }
     }
 

@@ -49,6 +49,7 @@ mod integrator;
 mod islands;
 mod limit;
 mod model;
+mod moments;
 mod nonlinear;
 mod patch;
 mod relaxation;
@@ -75,8 +76,8 @@ pub use nonlinear::{ElasticEnergy, Hyperelastic, Material, ReducedElasticity, po
 pub use patch::Patch;
 pub use relaxation::{Relaxation, ViscoelasticCoefficients};
 pub use step::{
-    Elasticity, Frame, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, RigidMotion, State,
-    StepReport, StepSettings,
+    Elasticity, Frame, FrameMotion, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load,
+    RigidMotion, State, StepReport, StepSettings,
 };
 pub use surface::SurfaceMesh;
 pub use warp::{warp, warp_jacobian};

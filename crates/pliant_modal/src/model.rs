@@ -5,6 +5,7 @@ use std::sync::{Arc, OnceLock};
 use serde::{Deserialize, Serialize};
 
 use crate::contact::ContactSites;
+use crate::moments::Moments;
 use crate::step::MassSites;
 use crate::{
     Basis, Hyperelastic, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh,
@@ -174,6 +175,8 @@ pub struct ModalModel {
     half: OnceLock<Basis>,
     /// The mass sites for gravity on a bent body, made at the first request.
     mass_sites: OnceLock<Arc<MassSites>>,
+    /// The first moments of the modes, made at the first request.
+    moments: OnceLock<Arc<Moments>>,
     /// The contact sites for all modes, made at the first request.
     contact_sites: OnceLock<Arc<ContactSites>>,
     /// The gradients of the reduced elasticity in the layout of a step, made at the first request.
@@ -231,6 +234,7 @@ impl ModalModel {
             basis,
             half: OnceLock::new(),
             mass_sites: OnceLock::new(),
+            moments: OnceLock::new(),
             contact_sites: OnceLock::new(),
             gradients: OnceLock::new(),
             size,
@@ -347,6 +351,20 @@ impl ModalModel {
     /// Participation of each mode in a uniform acceleration, kg^1/2.
     pub fn participation(&self) -> &[[f64; 3]] {
         &self.parts.participation
+    }
+
+    /// First moment `integral of rho phi_a r_b` of a mode of an anchored body, kg^1/2 m, body axes,
+    /// with `r` from the model's origin: how a turning of the anchors drives the mode. Zero for a
+    /// mode that the model does not have.
+    ///
+    /// The moments are fitted to the modes at the surface, at the first request.
+    pub fn moment(&self, mode: usize) -> [[f64; 3]; 3] {
+        let moment = self.moments().first.get(mode);
+        std::array::from_fn(|a| std::array::from_fn(|b| moment.map_or(0.0, |moment| moment[(a, b)])))
+    }
+
+    pub(crate) fn moments(&self) -> &Moments {
+        self.moments.get_or_init(|| Arc::new(Moments::new(self)))
     }
 
     /// The visible surface at rest.

@@ -14,8 +14,8 @@ use std::{
 
 use nonlinear_rod::nonlinear_rod;
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, Integrator, Islands, Patch, Plane, Relaxation, StepSettings,
-    Together,
+    Body, BodyConfig, Elasticity, FrameMotion, GrabConfig, Integrator, Islands, Patch, Plane, Relaxation,
+    StepSettings, Together,
 };
 use rod::{rod, tip};
 
@@ -111,6 +111,26 @@ fn a_step_that_bends_under_gravity_allocates_nothing() {
     let mut body = Body::new(model, settings.into()).unwrap();
     let before = CALLS.with(Cell::get);
     for _ in 0..100 {
+        body.step().unwrap();
+    }
+    assert_eq!(CALLS.with(Cell::get) - before, 0);
+    assert!(body.energy() > 0.0, "it bends");
+}
+
+#[test]
+fn a_step_whose_anchors_move_allocates_nothing() {
+    let pip = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal");
+    let model = Arc::new(pliant_modal::ModalModel::read(pip).unwrap());
+    let mut body = Body::new(model, BodyConfig::default()).unwrap();
+    let motion = FrameMotion {
+        acceleration: [3.0, -1.0, 0.5],
+        angular_velocity: [0.0, 4.0, 0.0],
+        angular_acceleration: [2.0, 0.0, 1.0],
+    };
+    body.set_frame_motion(motion).unwrap();
+    let before = CALLS.with(Cell::get);
+    for _ in 0..100 {
+        body.set_frame_motion(motion).unwrap();
         body.step().unwrap();
     }
     assert_eq!(CALLS.with(Cell::get) - before, 0);

@@ -1,9 +1,69 @@
-//! Gravity on the deformed shape of an anchored body.
+//! Gravity and the motion of the anchors, as forces on the deformed shape of an anchored body.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 
-use crate::ModalModel;
 use crate::warp::coefficients;
+use crate::{ModalModel, StepError, error::finite};
+
+/// Motion of the anchors of a body through the world at one moment. The anchors move as one rigid
+/// frame.
+///
+/// The mass of the body feels it as a force. At rest at `r` (m, body axes) it is, per unit mass,
+///
+/// ```text
+/// -(a + alpha x r + omega x (omega x r))
+/// ```
+///
+/// The forces that depend on the deformation itself are left out: `alpha x u`,
+/// `omega x (omega x u)` and Coriolis' `2 omega x u'`. Beside those of the rest shape they are as
+/// small as the displacement `u` beside the distance `r` from the origin. Coriolis' force is beside
+/// the elastic force of a mode of angular frequency `w` as `2 omega / w`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct FrameMotion {
+    /// Acceleration `a` of the model's origin, m/s^2, body axes.
+    pub acceleration: [f64; 3],
+    /// Angular velocity `omega`, rad/s, body axes.
+    pub angular_velocity: [f64; 3],
+    /// Angular acceleration `alpha`, rad/s^2, body axes.
+    pub angular_acceleration: [f64; 3],
+}
+
+impl FrameMotion {
+    /// Checks that all numbers are finite.
+    pub(crate) fn check(&self) -> Result<(), StepError> {
+        finite("acceleration of the anchors", &self.acceleration)?;
+        finite("angular velocity of the anchors", &self.angular_velocity)?;
+        finite("angular acceleration of the anchors", &self.angular_acceleration)
+    }
+
+    /// The inertial force per unit mass that this motion brings. Where it is above `limit` (m/s^2)
+    /// within `reach` (m) of the origin, all of it is scaled down to that.
+    pub(crate) fn force(&self, reach: f64, limit: f64) -> MassForce {
+        let acceleration = Vector3::from(self.acceleration);
+        let spin = Vector3::from(self.angular_velocity).cross_matrix();
+        let turn = Vector3::from(self.angular_acceleration).cross_matrix();
+        let gradient = -(turn + spin * spin);
+        let most = acceleration.norm() + gradient.norm() * reach;
+        let scale = if most > limit { limit / most } else { 1.0 };
+        MassForce { uniform: -scale * acceleration, gradient: scale * gradient }
+    }
+}
+
+/// A force per unit mass that depends linearly on the place at rest, m/s^2, body axes.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct MassForce {
+    /// Value at the model's origin, m/s^2.
+    pub(crate) uniform: Vector3<f64>,
+    /// Change with the place, 1/s^2.
+    pub(crate) gradient: Matrix3<f64>,
+}
+
+impl MassForce {
+    /// A force that is the same everywhere.
+    pub(crate) fn of_gravity(gravity: Vector3<f64>) -> Self {
+        Self { uniform: gravity, ..Self::default() }
+    }
+}
 
 /// Number of parts into which the mass of a body is divided.
 const SITES: usize = 16;
@@ -21,6 +81,8 @@ type Each = [f64; SITES];
 pub(crate) struct MassSites {
     /// Mass of each part, kg. Zero for unused parts.
     mass: Each,
+    /// Place of each part at rest (x, y, z), m.
+    places: [Each; 3],
     /// Displacement (x, y, z) and rotation (x, y, z) of each part per mode. The parts are stored
     /// side by side, so that one instruction handles several.
     modes: Vec<[Each; 6]>,
@@ -54,11 +116,15 @@ impl MassSites {
             let mass = model.mass() * share / whole;
             if mass.is_finite() { mass } else { 0.0 }
         });
+        let mut places = [[0.0; SITES]; 3];
         let mut modes = vec![[[0.0; SITES]; 6]; model.mode_count()];
         for (vertex, (&(_, site), area)) in nearest.iter().zip(&areas).enumerate() {
             let weight = area / share[site];
             if mass[site] <= 0.0 {
                 continue;
+            }
+            for (place, x) in places.iter_mut().zip(positions[vertex].iter()) {
+                place[site] += weight * x;
             }
             for (mode, rows) in modes.iter_mut().enumerate() {
                 for axis in 0..3 {
@@ -69,21 +135,20 @@ impl MassSites {
                 }
             }
         }
-        Self { mass, modes }
+        Self { mass, places, modes }
     }
 
-    /// Work of gravity beyond that of the undeformed shape's force, from rest to the shape `q`, J.
-    /// `gravity` is in body axes, m/s^2.
-    pub(crate) fn work(&self, gravity: &Vector3<f64>, q: &[f64]) -> f64 {
+    /// Work of a force beyond that on the undeformed shape, from rest to the shape `q`, J.
+    pub(crate) fn work(&self, force: &MassForce, q: &[f64]) -> f64 {
         let mut six = self.reduce(q);
-        self.work_and_forces(gravity, &mut six)
+        self.work_and_forces(force, &mut six)
     }
 
     /// Returns the same work as [`MassSites::work`] and adds its gradient, the modal force, to
     /// `force`.
-    pub(crate) fn add(&self, gravity: &Vector3<f64>, q: &[f64], force: &mut [f64]) -> f64 {
+    pub(crate) fn add(&self, by: &MassForce, q: &[f64], force: &mut [f64]) -> f64 {
         let mut six = self.reduce(q);
-        let work = self.work_and_forces(gravity, &mut six);
+        let work = self.work_and_forces(by, &mut six);
         for (force, rows) in force.iter_mut().zip(&self.modes) {
             let mut sums = [0.0; SITES];
             for (row, part) in rows.iter().zip(&six) {
@@ -114,11 +179,13 @@ impl MassSites {
     ///
     /// The nonlinear part of a part's displacement is `A w x u + B w x (w x u)` (Choi and Ko 2005),
     /// so the work is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
-    fn work_and_forces(&self, gravity: &Vector3<f64>, six: &mut [Each; 6]) -> f64 {
+    fn work_and_forces(&self, force: &MassForce, six: &mut [Each; 6]) -> f64 {
         let mut work = 0.0;
         for (i, mass) in self.mass.iter().enumerate() {
             let [x, y, z, wx, wy, wz] = six.each_ref().map(|row| row[i]);
-            let (u, w, g) = (Vector3::new(x, y, z), Vector3::new(wx, wy, wz), *mass * gravity);
+            let place = Vector3::from(self.places.each_ref().map(|row| row[i]));
+            let (u, w) = (Vector3::new(x, y, z), Vector3::new(wx, wy, wz));
+            let g = *mass * (force.uniform + force.gradient * place);
             let s = w.norm_squared();
             let [a, b, da, db] = coefficients(s);
             let (across, gw, wu, gu) = (u.cross(&g), g.dot(&w), w.dot(&u), g.dot(&u));
@@ -158,8 +225,14 @@ mod tests {
 
     #[test]
     fn the_work_is_that_of_the_warp_and_the_force_its_gradient() {
-        let mut sites = MassSites { mass: [0.0; SITES], modes: vec![[[0.0; SITES]; 6]; 6] };
-        let gravity = Vector3::new(1.0, -9.0, 2.0);
+        let places = [[0.0; SITES]; 3];
+        let mut sites = MassSites { mass: [0.0; SITES], places, modes: vec![[[0.0; SITES]; 6]; 6] };
+        // The second part is at x = 2 m, where the force is another.
+        sites.places[0][5] = 2.0;
+        let uniform = Vector3::new(1.0, -9.0, 2.0);
+        let change = Vector3::new(0.5, 2.0, -1.0);
+        let gradient = change * Vector3::x().transpose();
+        let gravity = MassForce { uniform, gradient };
         (sites.mass[0], sites.mass[5]) = (0.5, 2.0);
         for mode in 0..6 {
             sites.modes[mode][mode][0] = 1.0;
@@ -167,11 +240,11 @@ mod tests {
         }
         for turn in [1e-9, 0.1, 0.6, 2.0, 5.0, 9.0] {
             let q = [0.1, -0.2, 0.3, 0.8 * turn, -0.5 * turn, 0.3 * turn];
-            let part = |scale: f64, mass: f64| {
+            let part = |scale: f64, force: Vector3<f64>| {
                 let [d, w] = [0, 3].map(|at| [q[at], q[at + 1], q[at + 2]].map(|x| scale * x));
-                mass * gravity.dot(&(Vector3::from(crate::warp(w, d)) - Vector3::from(d)))
+                force.dot(&(Vector3::from(crate::warp(w, d)) - Vector3::from(d)))
             };
-            let want = part(1.0, 0.5) + part(-0.3, 2.0);
+            let want = part(1.0, 0.5 * uniform) + part(-0.3, 2.0 * (uniform + 2.0 * change));
             let mut force = [0.0; 6];
             let work = sites.add(&gravity, &q, &mut force);
             assert!((work - want).abs() < 1e-12, "{turn}: {work}, {want}");

@@ -12,10 +12,10 @@ use nalgebra::{Matrix3, Vector3};
 use group::{Parts, View};
 
 use super::{
-    Frame, Hand, Hold, RigidMotion, State, StepSettings,
+    Frame, FrameMotion, Hand, Hold, RigidMotion, State, StepSettings,
     constraint::ViscoelasticPatch,
     elastic::{ElasticStep, Tangent as ElasticTangent},
-    gravity::between,
+    gravity::{MassForce, between},
     modes::Modes,
     patch::{Grams, Six, Tangent, tangent},
     predicted_frame::PredictedFrame,
@@ -42,6 +42,8 @@ pub struct Load<'a> {
     pub force: Vector3<f64>,
     /// Torque on the frame of a free body about the center of mass, N m, world axes.
     pub torque: Vector3<f64>,
+    /// Motion of the anchors of an anchored body over the step. A free body ignores it.
+    pub motion: FrameMotion,
     /// Whether the frame of a free body is known from elsewhere. The step then leaves the frame as
     /// it is in the state.
     pub frame_is_given: bool,
@@ -511,59 +513,93 @@ impl Kernel {
 
     /// Prepares the data that gravity needs, so that the first step does not allocate them.
     fn prepare_weight(&self) {
-        if self.bends_under_gravity() {
+        if self.bends_under(&self.gravity(&Frame::default())) {
+            self.model.mass_sites();
+        }
+    }
+
+    /// Prepares the data that [`Load::motion`] needs, so that the steps do not allocate them.
+    pub(crate) fn prepare_motion(&self) {
+        if !self.model.is_free() {
+            self.model.moments();
             self.model.mass_sites();
         }
     }
 
     /// Writes the modal force of gravity on an anchored body, kg^1/2 m/s^2, to `force`.
     pub(crate) fn weight(&self, frame: &Frame, q: &[f64], force: &mut [f64]) {
-        self.weight_at_rest(frame, force);
-        if self.bends_under_gravity() {
-            let local = frame.rotation().inverse() * Vector3::from(self.settings.gravity);
-            self.model.mass_sites().add(&local, q, force);
+        let gravity = self.gravity(frame);
+        self.force_at_rest(&gravity, force);
+        if self.bends_under(&gravity) {
+            self.model.mass_sites().add(&gravity, q, force);
         }
     }
 
-    /// Whether the work of gravity on the deformed shape differs from that on the rest shape.
-    fn bends_under_gravity(&self) -> bool {
-        self.warps() && !self.model.is_free() && self.settings.gravity != [0.0; 3]
+    /// Gravity on the modes of an anchored body. That on a free body moves its frame.
+    fn gravity(&self, frame: &Frame) -> MassForce {
+        if self.model.is_free() {
+            return MassForce::default();
+        }
+        MassForce::of_gravity(frame.rotation().inverse() * Vector3::from(self.settings.gravity))
     }
 
-    /// Writes the modal force of gravity on the undeformed shape to `force`.
-    fn weight_at_rest(&self, frame: &Frame, force: &mut [f64]) {
+    /// Gravity and the motion of the anchors as forces on the modes of an anchored body.
+    ///
+    /// The anchors leave no part of the body behind faster than it can follow: in one step its
+    /// lowest mode gains at most the speed with which it swings by the size of the body, and moves
+    /// by at most that size. A frame that jumps thus does not tear the body apart.
+    fn mass_force(&self, frame: &Frame, motion: &FrameMotion) -> MassForce {
+        let gravity = self.gravity(frame);
+        if self.model.is_free() || *motion == FrameMotion::default() {
+            return gravity;
+        }
+        let Some(lowest) = self.modes.omega.first() else { return gravity };
+        let limit = self.model.size() * lowest.min(1.0 / self.h) / self.h;
+        let inertia = motion.force(self.model.moments().reach, limit);
+        MassForce { uniform: gravity.uniform + inertia.uniform, ..inertia }
+    }
+
+    /// Whether the work of a force on the deformed shape differs from that on the rest shape.
+    fn bends_under(&self, force: &MassForce) -> bool {
+        self.warps() && *force != MassForce::default()
+    }
+
+    /// Writes the modal force of `by` on the undeformed shape to `force`.
+    fn force_at_rest(&self, by: &MassForce, force: &mut [f64]) {
         force.fill(0.0);
-        let gravity = Vector3::from(self.settings.gravity);
-        if self.model.is_free() || gravity == Vector3::zeros() {
+        if *by == MassForce::default() {
             return;
         }
-        let local = frame.rotation().inverse() * gravity;
         for (f, participation) in force.iter_mut().zip(self.model.participation()) {
-            *f = local.dot(&Vector3::from(*participation));
+            *f = by.uniform.dot(&Vector3::from(*participation));
+        }
+        if by.gradient != Matrix3::zeros() {
+            for (f, moment) in force.iter_mut().zip(&self.model.moments().first) {
+                *f += by.gradient.dot(moment);
+            }
         }
     }
 
-    /// Adds the effect of gravity on the bend between both shapes of the step to the step without
+    /// Adds the effect of `by` on the bend between both shapes of the step to the step without
     /// hands.
-    fn bend_under_gravity(&mut self, state: &mut State) {
+    fn bend_under(&mut self, by: &MassForce, state: &mut State) {
         /// Maximum number of rounds. The force changes the end of the step, which changes the
         /// force.
         const MAX_ROUNDS: usize = 12;
         /// Tolerance of the bend force, as a share of the largest force.
         const SHARE: f64 = 1e-6;
-        let local = state.frame.rotation().inverse() * Vector3::from(self.settings.gravity);
         let sites = self.model.mass_sites();
         let enough = SHARE * self.force.iter().fold(0.0f64, |most, f| most.max(f.abs()));
         // The first round takes the force at the beginning as constant. `pulls` is the change of a
         // round.
         self.start.fill(0.0);
-        let before = sites.add(&local, &self.before.q, &mut self.start);
+        let before = sites.add(by, &self.before.q, &mut self.start);
         self.bend.copy_from_slice(&self.start);
         self.pulls.copy_from_slice(&self.start);
         self.modes.respond(&self.pulls, state);
         for round in 0..MAX_ROUNDS {
             self.pulls.copy_from_slice(&self.start);
-            let work = sites.add(&local, &state.q, &mut self.pulls) - before;
+            let work = sites.add(by, &state.q, &mut self.pulls) - before;
             self.pulls.iter_mut().for_each(|force| *force *= 0.5);
             between(&self.before.q, &state.q, work, &mut self.pulls);
             let mut change = 0.0f64;
@@ -603,18 +639,18 @@ impl Kernel {
         if self.model.is_free() {
             return -self.model.mass() * gravity.dot(&Vector3::from(state.frame.center()));
         }
-        let local = state.frame.rotation().inverse() * gravity;
+        let local = self.gravity(&state.frame);
         let straight = state.q.iter().zip(self.model.participation());
-        let straight: f64 = straight.map(|(q, p)| q * local.dot(&Vector3::from(*p))).sum();
+        let straight: f64 = straight.map(|(q, p)| q * local.uniform.dot(&Vector3::from(*p))).sum();
         let bent = if self.warps() { self.model.mass_sites().work(&local, &state.q) } else { 0.0 };
         -(straight + bent)
     }
 
     fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
         let gravity = Vector3::from(self.settings.gravity);
-        let bends = self.bends_under_gravity();
+        let on_mass = self.mass_force(&state.frame, &load.motion);
         let mut force = std::mem::take(&mut self.force);
-        self.weight_at_rest(&state.frame, &mut force);
+        self.force_at_rest(&on_mass, &mut force);
         self.force = force;
         for (f, load) in self.force.iter_mut().zip(load.modal) {
             *f += load;
@@ -623,8 +659,8 @@ impl Kernel {
             self.force.iter_mut().zip(&self.push.modal).for_each(|(f, push)| *f += push);
         }
         self.modes.advance(&self.before, &self.force, state);
-        if bends {
-            self.bend_under_gravity(state);
+        if self.bends_under(&on_mass) {
+            self.bend_under(&on_mass, state);
         }
         let rigid = (self.model.is_free() && !load.frame_is_given).then(|| {
             let [force, torque] = self.push.at_once(load.force, load.torque);

@@ -14,6 +14,7 @@ mod solve;
 mod state;
 
 pub use constraint::{GrabConfig, Hand, Hold};
+pub use gravity::FrameMotion;
 pub use implied::ImpliedPulls;
 pub use kernel::{Kernel, Load, StepReport};
 pub use patch::HeldPatch;

@@ -388,7 +388,7 @@ impl PredictedHand {
             self.replica.hold_at(copy, key, (g.vertex, g.radius), target.into(), g.hold);
         }
         let (force, torque) = self.push;
-        let load = Load { modal: receiver.load(), force, torque, frame_is_given: false };
+        let load = Load { modal: receiver.load(), force, torque, ..Load::default() };
         self.replica.step_held(copy, &load);
     }
 
