@@ -158,9 +158,10 @@ impl PluginGroup for PliantPlugins {
 pub mod prelude {
     pub use crate::PliantPlugins;
     pub use crate::body::{
-        BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Impulse, Integrator, ModalAsset,
-        ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, Push,
-        Relaxation, SingleSteps, StepSettings, VisualState,
+        BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Impulse, Inertia, Integrator,
+        ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems,
+        PliantTick, Push, Relaxation, RideOn, SingleSteps, StepSettings, SurfaceAnchor, SurfacePlace,
+        Teleport, VisualState,
     };
     #[cfg(feature = "picking")]
     pub use crate::body::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};

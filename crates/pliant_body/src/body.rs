@@ -8,7 +8,7 @@ use pliant_modal::{
     Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings,
 };
 
-use crate::{ModalAsset, VisualState, grab::GrabHold};
+use crate::{Inertia, ModalAsset, VisualState, grab::GrabHold};
 
 /// A soft body: its model and its step settings.
 ///
@@ -27,8 +27,8 @@ use crate::{ModalAsset, VisualState, grab::GrabHold};
 ///
 /// The entity's `GlobalTransform` places the body by a rotation, a translation and a positive,
 /// uniform scale. The scale multiplies lengths and forces. Masses, stiffness (N/m) and frequencies
-/// keep their baked values. Moving the transform of an anchored body moves its anchors without
-/// inertia (quasi-static). A free body writes its own motion into its `Transform` in each frame and
+/// keep their baked values. Moving the transform of an anchored body, or of an entity above it, moves
+/// its anchors, which the body feels as [`Inertia`]. A free body writes its own motion into its `Transform` in each frame and
 /// must have no parent. Writing the transform of a free body moves the body there and keeps its
 /// velocity.
 ///
@@ -37,7 +37,7 @@ use crate::{ModalAsset, VisualState, grab::GrabHold};
 /// ([`BodyRefused`](crate::BodyRefused)), and the body keeps its previous settings.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
-#[require(Transform, Visibility, Driven)]
+#[require(Transform, Visibility, Driven, Inertia)]
 pub struct ModalBody {
     /// The baked body. A new handle, or a new asset behind the handle, makes a new body at rest.
     /// Grabs stay if the new model has their vertex.

@@ -48,6 +48,13 @@ pub enum BodyError {
     /// The body of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is remote.
     #[error("the impulse was refused: this body is driven remotely and is not stepped here")]
     NotLocal,
+    /// The body of a [`SurfaceAnchor`](crate::SurfaceAnchor) does not exist or was despawned.
+    #[error("there is no body whose surface this entity could follow; it stays where it is")]
+    NoSurface,
+    /// The surface of the body does not have the place of a
+    /// [`SurfaceAnchor`](crate::SurfaceAnchor).
+    #[error("the body has no such place on its surface; the entity stays where it is")]
+    NoSurfacePlace,
     /// An obstacle has a number that is not finite or out of range. Bodies do not touch it.
     #[error("the obstacle was refused: {0}")]
     Obstacle(StepError),
@@ -86,7 +93,8 @@ pub enum BodyError {
 #[derive(Message, Reflect, Debug)]
 #[reflect(from_reflect = false)]
 pub struct BodyRefused {
-    /// The entity of the refused component, or the entity that a message named: a body or a grab.
+    /// The entity of the refused component, or the entity that a message named: a body, a grab or a
+    /// surface anchor.
     pub entity: Entity,
     /// The error: the expected and the actual input.
     #[reflect(ignore)]

@@ -22,6 +22,8 @@
 //! | `Transform`: the body's position, rotation and scale | [`VisualState`]: the state on screen |
 //! | [`Grab`] and [`GrabOf`] on a separate entity: a grab of a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
 //! | [`Impulse`], [`Push`] as messages: an impulse, N s; a force for one tick, N | [`BodyState::body`]: the result |
+//! | [`Inertia`], [`RideOn`]: how strongly it feels its entity move, and a bone that it rides on | |
+//! | [`SurfaceAnchor`] on another entity: it sits on the surface | its `Transform` |
 //! | [`Driven::Remote`]: another source moves the body | [`PliantTick`]: the number of the step |
 //! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: sharp edges, level of detail, GPU or CPU (feature `render`) | [`BodyRefused`]: a refused input with its error |
 //!
@@ -51,13 +53,16 @@ mod error;
 mod grab;
 mod held;
 mod impulse;
+mod inertia;
 mod pause;
 mod pick;
 #[cfg(feature = "picking")]
 mod picking;
 #[cfg(feature = "picking")]
 mod pointer;
+mod ride_on;
 mod step;
+mod surface_anchor;
 #[cfg(test)]
 mod tests;
 mod visual;
@@ -81,12 +86,15 @@ pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabs};
 pub use held::HeldShapesCache;
 pub use impulse::{Impulse, Push};
+pub use inertia::{Inertia, Teleport};
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
 pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSettings};
 #[cfg(feature = "picking")]
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
+pub use ride_on::RideOn;
 pub use step::PliantTick;
+pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
 pub use visual::{Pose, VisualState};
 
 /// Diagnostic: time of one tick's steps of all awake bodies, ms.
@@ -188,10 +196,15 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<SingleSteps>()
             .register_type::<Impulse>()
             .register_type::<Push>()
+            .register_type::<Inertia>()
+            .register_type::<Teleport>()
+            .register_type::<RideOn>()
+            .register_type::<SurfaceAnchor>()
             .add_message::<BodyRefused>()
             .add_message::<SingleSteps>()
             .add_message::<Impulse>()
             .add_message::<Push>()
+            .add_message::<Teleport>()
             .init_resource::<PliantTick>()
             .init_resource::<HeldShapesCache>()
             .insert_resource(step::Stepping { fixed })
@@ -222,6 +235,7 @@ impl Plugin for PliantBodyPlugin {
                         step::count_tick,
                         visual::begin_tick,
                         step::place_bodies,
+                        inertia::ride,
                         step::hold_bodies,
                         held::shape_held,
                         impulse::hit_bodies,
@@ -232,11 +246,15 @@ impl Plugin for PliantBodyPlugin {
                     step::publish.in_set(PliantSystems::Publish),
                 ),
             )
-            .add_systems(PreUpdate, pause::single_steps)
+            .add_systems(PreUpdate, (pause::single_steps, inertia::forget_paused))
             .add_systems(
                 PostUpdate,
                 (
                     visual::interpolate.in_set(PliantDisplaySystems::Interpolate),
+                    (ride_on::find_parents, surface_anchor::place_on_surfaces)
+                        .chain()
+                        .after(PliantDisplaySystems::Interpolate)
+                        .before(TransformSystems::Propagate),
                     // This runs after transform propagation, so that no body is stepped with an
                     // outdated transform.
                     step::build_bodies
@@ -244,6 +262,9 @@ impl Plugin for PliantBodyPlugin {
                         .before(PliantDisplaySystems::Deform),
                 ),
             );
+        if fixed {
+            app.add_systems(FixedPreUpdate, inertia::begin_tick).add_systems(FixedLast, inertia::end_tick);
+        }
         #[cfg(feature = "render")]
         deform::build(app);
     }

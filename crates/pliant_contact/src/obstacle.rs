@@ -9,7 +9,7 @@ use bevy::{
     prelude::*,
 };
 use nalgebra::Vector3;
-use pliant_body::{BodyError, BodyRefused};
+use pliant_body::{BodyError, BodyRefused, Pose};
 use pliant_modal as modal;
 
 #[cfg(feature = "mesh")]
@@ -82,10 +82,6 @@ impl ContactLayers {
     }
 }
 
-/// Speed above which a way is a teleport, m/s, and turning speed above which a turn is one, rad/s.
-const TELEPORT: f64 = 100.0;
-const TELEPORT_TURN: f64 = 100.0;
-
 /// The shape of an obstacle, as far as its component tells it, or its triangles.
 #[derive(Debug, Clone)]
 enum Shape {
@@ -122,11 +118,6 @@ pub(crate) struct Motion {
     pub(crate) sound: bool,
 }
 
-/// Angular velocity that turns `from` into `to` in `step` seconds, rad/s.
-fn spin(from: DQuat, to: DQuat, step: f64) -> DVec3 {
-    (to * from.inverse()).normalize().to_scaled_axis() / step
-}
-
 impl Motion {
     /// `solid` gives the shape of a mesh at a scale, when it is known.
     fn new(
@@ -160,10 +151,9 @@ impl Motion {
 
     /// Continues the motion of `last` over a step (s).
     fn after(mut self, last: &Self, step: f64) -> Self {
-        let velocity = (self.position - last.position) / step;
-        let spin = spin(last.rotation, self.rotation, step);
-        if velocity.length() <= TELEPORT && spin.length() <= TELEPORT_TURN {
-            (self.velocity, self.spin) = (velocity, spin);
+        let [now, before] = [&self, last].map(|at| Pose { origin: at.position, orientation: at.rotation });
+        if let Some(ways) = now.velocity_since(&before, step) {
+            [self.velocity, self.spin] = ways;
         }
         self.changed = Self { changed: last.changed, sound: last.sound, ..self.clone() } != *last;
         self.sound = last.sound;

@@ -419,6 +419,21 @@ impl ModalModel {
         self.parts.rotation.get(self.row(vertex, axis, mode)).copied().unwrap_or(0.0)
     }
 
+    /// Position of one surface vertex at modal coordinates `q`, m, body axes, bent by modal warping
+    /// if `warps`. It is one row of [`Basis::reconstruct`]. `None` for a vertex that is not on the
+    /// surface.
+    pub fn vertex_position(&self, vertex: u32, q: &[f64], warps: bool) -> Option<[f64; 3]> {
+        let rest = self.surface().positions().get(vertex as usize)?;
+        let sum = |row: fn(&Self, u32, usize, usize) -> f32| -> [f64; 3] {
+            std::array::from_fn(|axis| {
+                q.iter().enumerate().map(|(mode, q)| q * f64::from(row(self, vertex, axis, mode))).sum()
+            })
+        };
+        let straight = sum(Self::displacement_row);
+        let moved = if warps { crate::warp(sum(Self::rotation_row), straight) } else { straight };
+        Some(std::array::from_fn(|axis| f64::from(rest[axis]) + moved[axis]))
+    }
+
     fn row(&self, vertex: u32, axis: usize, mode: usize) -> usize {
         let count = self.parts.surface.positions().len();
         if axis > 2 || vertex as usize >= count || mode >= self.mode_count() {

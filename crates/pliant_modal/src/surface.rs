@@ -2,7 +2,9 @@
 
 use std::collections::HashMap;
 
-use crate::ModelError;
+use nalgebra::Vector3;
+
+use crate::{ModelError, contact::closest_on_triangle};
 
 /// A triangle surface at rest in body axes (m), with the adjacency that patches and normals need.
 #[derive(Debug, Clone, PartialEq)]
@@ -160,6 +162,23 @@ impl SurfaceMesh {
             }
         }
         [low, high]
+    }
+
+    /// The triangle that is nearest to a point (m, body axes) at rest, and the weights of its three
+    /// corners at the place nearest to the point. `None` for a point that is not finite. The
+    /// function tests every triangle.
+    pub fn nearest(&self, point: [f64; 3]) -> Option<(u32, [f64; 3])> {
+        let point = Vector3::from(point);
+        let place = |(index, triangle): (usize, &[u32; 3])| {
+            let corners = triangle.map(|v| Vector3::from(self.positions[v as usize].map(f64::from)));
+            let weights = closest_on_triangle(corners.each_ref(), &point);
+            let there: Vector3<f64> = corners.iter().zip(weights).map(|(corner, w)| *corner * w).sum();
+            let distance = (there - point).norm_squared();
+            distance.is_finite().then_some((distance, index as u32, weights))
+        };
+        let all = self.triangles.iter().enumerate().filter_map(place);
+        let (_, triangle, weights) = all.min_by(|a, b| a.0.total_cmp(&b.0))?;
+        Some((triangle, weights))
     }
 
     /// Largest extent of the bounds of the rest shape, m.

@@ -7,6 +7,7 @@ mod grabs;
 #[cfg(feature = "bake")]
 mod held;
 mod impulses;
+mod inertia;
 mod load;
 pub mod model;
 mod pausing;
@@ -14,6 +15,7 @@ mod pausing;
 mod pointer;
 mod settings;
 mod stepping;
+mod surface_anchor;
 
 use std::{sync::Arc, time::Duration};
 

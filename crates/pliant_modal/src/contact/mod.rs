@@ -36,4 +36,4 @@ pub(crate) use point::{Far, Memory, Point};
 pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};
 pub(crate) use solver::{Clearance, Look, Touching};
-pub(crate) use surface_field::{Bent, Cloud, Place};
+pub(crate) use surface_field::{Bent, Cloud, Place, closest_on_triangle};

@@ -161,7 +161,7 @@ pub(crate) struct SurfaceField {
 
 /// The closest point of a triangle to a point, as weights of its corners (Ericson, Real-Time
 /// Collision Detection, 5.1.5).
-fn closest_on_triangle([a, b, c]: [&Vector3<f64>; 3], p: &Vector3<f64>) -> [f64; 3] {
+pub(crate) fn closest_on_triangle([a, b, c]: [&Vector3<f64>; 3], p: &Vector3<f64>) -> [f64; 3] {
     let (ab, ac, ap) = (b - a, c - a, p - a);
     let (d1, d2) = (ab.dot(&ap), ac.dot(&ap));
     if d1 <= 0.0 && d2 <= 0.0 {
