@@ -97,6 +97,7 @@ picture many_bodies many_bodies
 picture materials materials
 picture free_bodies free_bodies
 picture falling falling
+picture walk walk
 picture feel feel
 picture two_hands two_hands
 # A slow renderer needs a while until the body is there.

@@ -2,11 +2,11 @@
 //!
 //! The motion comes from the way of the entity between two looks at it, one in every tick. A
 //! transform is written in the fixed loop, so that its ways belong to ticks, or once per frame, so
-//! that they belong to frames. A way is divided by the time that belongs to it: constant velocity
+//! that they belong to frames. A way is divided by the time that belongs to it: a constant velocity
 //! is then constant at every frame rate, whatever the ticks are.
 
 use bevy::{
-    math::{Affine3A, DVec3},
+    math::{Affine3A, DQuat, DVec3},
     prelude::*,
 };
 use pliant_modal::FrameMotion;
@@ -22,11 +22,11 @@ use crate::{BodyError, BodyState, Driven, ModalBody, Pose, step::Refusals};
 /// this app does not step ([`Driven::Remote`]): those of guests and of peers.
 ///
 /// Transforms may be written in the fixed loop or once per frame. A velocity that does not change
-/// gives no force, at any frame rate. A change of velocity is passed on within the longer of a tick
-/// and a frame. The sum of the forces over time is always that of the motion. In the fixed loop,
-/// whatever moves the entity is best ordered before
-/// [`PliantSystems::Input`](crate::PliantSystems::Input), otherwise the body feels it one tick
-/// later. If the bodies are not stepped in the fixed loop, it must be.
+/// gives no force, at any frame rate, and the sum of the forces over time is that of the motion. A
+/// body feels what is written in the fixed loop in the same tick, if it is written before
+/// [`PliantSystems::Input`](crate::PliantSystems::Input), and otherwise in the next. It feels what
+/// is written once per frame one and a half frames and half a tick later. Bodies that are not
+/// stepped in the fixed loop need the order before that set.
 ///
 /// A way faster than 100 m/s, or a turn faster than 100 rad/s, is a teleport and has no effect.
 /// [`Teleport`] announces a shorter one. What the entity does while time is paused has none either.
@@ -95,78 +95,135 @@ struct Look {
     frame: f64,
 }
 
+/// A way of an entity between two looks.
+#[derive(Debug, Clone, Copy)]
+struct Way {
+    /// Time of its middle, and its duration, s.
+    middle: f64,
+    seconds: f64,
+    /// Velocity (m/s) and angular velocity (rad/s), world axes.
+    velocity: [DVec3; 2],
+    /// Orientation in the middle.
+    orientation: DQuat,
+}
+
 /// What a body knows of the motion of its entity.
 #[derive(Component, Debug, Default)]
 pub(crate) struct Ride {
     /// The last look.
     last: Option<Look>,
-    /// Place at the end of the last tick. `None`: nothing that is known.
+    /// Place at the end of the last tick.
     left: Option<Affine3A>,
     /// Whether the entity has moved outside of the fixed loop since the last look.
     outside: bool,
-    /// Whether the entity is moved once per frame.
-    by_frame: bool,
-    /// Velocity and angular velocity on the last way, and their time, world axes, m/s and rad/s.
-    measured: Option<([DVec3; 2], f64)>,
-    /// The same, as far as the body has felt them.
-    felt: [DVec3; 2],
+    /// Whether the entity is moved in ticks, and not once per frame.
+    by_tick: bool,
+    /// The last ways, oldest first.
+    ways: Vec<Way>,
+    /// Time by which the body feels the motion late, s.
+    delay: f64,
+    /// Velocities and time up to which the body has felt the motion. `None` before the first way.
+    felt: Option<[DVec3; 2]>,
+    felt_until: f64,
 }
 
 impl Ride {
+    /// Number of ways that are kept, more than fit into the longest delay.
+    const WAYS: usize = 6;
+
     /// Takes a look, and returns the motion over the step that comes, in world lengths.
-    fn look(&mut self, now: Look, step: f64, teleported: bool) -> FrameMotion {
+    ///
+    /// Velocities belong to the middles of ways, and change evenly from middle to middle. Where
+    /// frames and ticks differ, the body feels them some time late, so that there always is a next
+    /// middle. The forces are then as smooth as the motion.
+    fn look(&mut self, now: Look, step: f64, frame: f64, teleported: bool) -> FrameMotion {
         let moved = std::mem::take(&mut self.outside);
         let Some(last) = self.last.replace(now) else { return FrameMotion::default() };
-        if moved || !is_same(&now.affine, &last.affine) {
-            self.by_frame = moved;
+        let is_still = !moved && is_same(&now.affine, &last.affine);
+        if !is_still && self.by_tick == moved {
+            self.by_tick = !moved;
+            self.ways.clear();
+            (self.felt_until, self.delay) = (0.0, 0.0);
         }
-        let seconds = if self.by_frame { now.frame - last.frame } else { now.tick - last.tick };
+        let time = |look: &Look| if self.by_tick { look.tick } else { look.frame };
+        let seconds = time(&now) - time(&last);
         // Without a frame since the last look, the entity goes on as it did.
         if seconds > 0.0 || teleported {
-            match now.pose.velocity_since(&last.pose, seconds).filter(|_| !teleported) {
-                Some(ways) => {
-                    if self.measured.is_none() {
-                        // A body that begins on a moving entity moves with it.
-                        self.felt = ways;
-                    }
-                    self.measured = Some((ways, seconds));
-                }
-                None => {
-                    // What moves ahead goes on ahead after it was turned.
-                    let turn = now.pose.orientation * last.pose.orientation.inverse();
-                    let turned = |ways: [DVec3; 2]| ways.map(|way| turn * way);
-                    self.measured = self.measured.map(|(ways, seconds)| (turned(ways), seconds));
-                    self.felt = turned(self.felt);
+            let way = now.pose.velocity_since(&last.pose, seconds).filter(|_| !teleported);
+            if way.is_none() {
+                // What was turned goes on ahead.
+                let turn = now.pose.orientation * last.pose.orientation.inverse();
+                self.felt = self.felt.map(|felt| felt.map(|velocity| turn * velocity));
+                for way in &mut self.ways {
+                    way.velocity = way.velocity.map(|velocity| turn * velocity);
+                    way.orientation = turn * way.orientation;
                 }
             }
+            let ahead = self.ways.last().map(|way| way.velocity).or(self.felt);
+            let from = if way.is_some() { last.pose.orientation } else { now.pose.orientation };
+            let way = Way {
+                middle: time(&now) - 0.5 * seconds,
+                seconds,
+                velocity: way.or(ahead).unwrap_or_default(),
+                orientation: from.slerp(now.pose.orientation, 0.5),
+            };
+            if seconds > 0.0 {
+                if self.ways.len() == Self::WAYS {
+                    self.ways.remove(0);
+                }
+                self.ways.push(way);
+            }
         }
-        let Some((ways, seconds)) = self.measured else { return FrameMotion::default() };
+        // The middle of the last way is at most so old.
+        let late = if self.by_tick { 0.5 * step } else { 1.5 * frame + 0.5 * step };
+        // Frames differ in length.
+        self.delay = if self.delay > 0.0 { 0.9 * self.delay + 0.1 * late } else { late };
+        let until = (now.tick - self.delay).max(self.felt_until);
+        let middle = 0.5 * (until + self.felt_until.max(until - step));
+        self.felt_until = until;
+        let (Some((velocity, orientation)), Some((_, axes))) = (self.at(until), self.at(middle)) else {
+            return FrameMotion::default();
+        };
         // Single precision does not know velocities better than this.
         let ulp = f64::from(f32::EPSILON);
+        let shortest = self.ways.iter().map(|way| way.seconds).fold(f64::INFINITY, f64::min);
         let far = now.pose.origin.abs().max_element().max(last.pose.origin.abs().max_element());
-        let unsure = [8.0 * ulp * far / seconds, 16.0 * ulp / seconds];
-        let share = (step / seconds).min(1.0);
+        let unsure = [8.0 * ulp * far / shortest, 16.0 * ulp / shortest];
         let mut accelerations = [DVec3::ZERO; 2];
+        // A body that begins on a moving entity moves with it.
+        let felt = self.felt.get_or_insert(velocity);
         for (k, acceleration) in accelerations.iter_mut().enumerate() {
-            let change = ways[k] - self.felt[k];
-            if change.length() > unsure[k] + 1e-6 * ways[k].length() {
-                self.felt[k] += share * change;
-                *acceleration = share * change / step;
+            let change = velocity[k] - felt[k];
+            if change.length() > unsure[k] + 1e-6 * velocity[k].length() {
+                felt[k] = velocity[k];
+                *acceleration = axes.inverse() * (change / step);
             }
         }
-        // A change between two ways belongs to the moment between them.
-        let [acceleration, turning] = accelerations.map(|change| last.pose.orientation.inverse() * change);
-        let spin = now.pose.orientation.inverse() * self.felt[1];
-        FrameMotion {
-            acceleration: acceleration.into(),
-            angular_velocity: spin.into(),
-            angular_acceleration: turning.into(),
-        }
+        let [acceleration, angular_acceleration] = accelerations.map(Into::into);
+        let angular_velocity = (orientation.inverse() * felt[1]).into();
+        FrameMotion { acceleration, angular_velocity, angular_acceleration }
+    }
+
+    /// Velocities and orientation at a time, s, between the middles of the ways.
+    fn at(&self, time: f64) -> Option<([DVec3; 2], DQuat)> {
+        let after = self.ways.iter().position(|way| way.middle >= time);
+        let next = after.map_or(self.ways.last(), |after| self.ways.get(after))?;
+        let before = after.and_then(|after| self.ways.get(after.checked_sub(1)?));
+        let Some(before) = before else { return Some((next.velocity, next.orientation)) };
+        let share = (time - before.middle) / (next.middle - before.middle);
+        let velocity = [0, 1].map(|k| before.velocity[k].lerp(next.velocity[k], share));
+        Some((velocity, before.orientation.slerp(next.orientation, share)))
     }
 }
 
 fn is_same(a: &Affine3A, b: &Affine3A) -> bool {
     a.to_cols_array().map(f32::to_bits) == b.to_cols_array().map(f32::to_bits)
+}
+
+fn place(global: &GlobalTransform) -> (Affine3A, Pose) {
+    let (_, rotation, translation) = global.to_scale_rotation_translation();
+    let pose = Pose { origin: translation.as_dvec3(), orientation: rotation.as_dquat().normalize() };
+    (global.affine(), pose)
 }
 
 /// Notes which entities have moved since the last tick: outside of the fixed loop.
@@ -211,20 +268,19 @@ pub(crate) fn ride(
     for (name, inertia, driven, mut ride, mut state) in &mut bodies {
         let factor = inertia.factor();
         let global = transforms.compute_global_transform(name.entity).ok();
-        let global = global.filter(|global| global.affine().is_finite());
+        let (affine, pose) = global.as_ref().map(place).unzip();
+        let pose = pose.filter(|pose| pose.origin.is_finite() && pose.orientation.is_finite());
         let felt = *driven == Driven::Local && !state.model().is_free() && factor > 0.0;
-        let Some(global) = global.filter(|_| felt) else {
+        let (Some(affine), Some(pose), true) = (affine, pose, felt) else {
             *ride = Ride::default();
             continue;
         };
-        let (_, rotation, translation) = global.to_scale_rotation_translation();
-        let pose = Pose { origin: translation.as_dvec3(), orientation: rotation.as_dquat().normalize() };
         let on_it = |of: Entity| teleports.contains(&of);
         let teleported =
             !teleports.is_empty() && (on_it(name.entity) || parents.iter_ancestors(name.entity).any(on_it));
-        let look = Look { affine: global.affine(), pose, tick, frame };
+        let look = Look { affine, pose, tick, frame };
         let FrameMotion { acceleration, angular_velocity, angular_acceleration } =
-            ride.look(look, step, teleported);
+            ride.look(look, step, frames.delta_secs_f64(), teleported);
         let times = |vector: [f64; 3], factor: f64| vector.map(|x| factor * x);
         let motion = FrameMotion {
             acceleration: times(acceleration, factor / state.scale),

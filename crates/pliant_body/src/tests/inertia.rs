@@ -66,7 +66,8 @@ fn a_constant_velocity_gives_no_force_at_any_frame_rate() {
             run(&mut app, frames, 3.0);
             let velocity = state(&app, body).body().frame().origin()[0];
             assert!(velocity > 10.0, "it moves: {velocity}");
-            assert_eq!(state(&app, body).body().energy(), 0.0, "{by:?} at {frames} Hz");
+            let energy = state(&app, body).body().energy();
+            assert_eq!(energy, 0.0, "{by:?} at {frames} Hz");
         }
     }
 }
@@ -88,9 +89,8 @@ fn an_accelerated_entity_bends_its_body_as_the_opposite_gravity_does() {
                 mean += share / count as f64;
                 most = most.max((share - 1.0).abs());
             }
-            // At another rate than that of the ticks the changes come in lumps. Their sum is right.
             assert!((mean - 1.0).abs() < 0.01, "{by:?} at {frames} Hz: {mean}");
-            assert!(most < 0.25, "{by:?} at {frames} Hz: {most}");
+            assert!(most < 0.02, "{by:?} at {frames} Hz: {most}");
         }
     }
 }
@@ -134,7 +134,7 @@ fn a_turning_parent_takes_gravity_with_the_world() {
     let body = spawn_with(&mut app, model::bar(), fall, ChildOf(parent));
     steps(&mut app, 800);
     let (down, side) = (q(&app, body, 0), q(&app, body, 1));
-    assert!(down < 0.0 && side.abs() < 1e-6 * down.abs(), "{down} {side}");
+    assert!(down < 0.0 && side.abs() < 1e-3 * down.abs(), "{down} {side}");
     let mut transform = app.world_mut().get_mut::<Transform>(parent).unwrap();
     transform.rotation = Quat::from_rotation_x(-(TAU / 4.0) as f32);
     app.world_mut().write_message(Teleport(parent));

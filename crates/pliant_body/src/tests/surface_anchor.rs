@@ -110,7 +110,7 @@ fn an_anchor_of_a_resting_body_writes_nothing() {
     app.init_resource::<Writes>().add_systems(
         Last,
         |moved: Query<(), (Changed<Transform>, With<SurfaceAnchor>)>, mut writes: ResMut<Writes>| {
-            writes.0 += moved.iter().len();
+            writes.0 += moved.iter().count();
         },
     );
     steps(&mut app, 2);
