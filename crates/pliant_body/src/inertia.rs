@@ -161,17 +161,13 @@ impl Ride {
             }
             let ahead = self.ways.last().map(|way| way.velocity).or(self.felt);
             let from = if way.is_some() { last.pose.orientation } else { now.pose.orientation };
-            let way = Way {
-                middle: time(&now) - 0.5 * seconds,
-                seconds,
-                velocity: way.or(ahead).unwrap_or_default(),
-                orientation: from.slerp(now.pose.orientation, 0.5),
-            };
-            if seconds > 0.0 {
+            if let (Some(velocity), true) = (way.or(ahead), seconds > 0.0) {
                 if self.ways.len() == Self::WAYS {
                     self.ways.remove(0);
                 }
-                self.ways.push(way);
+                let middle = time(&now) - 0.5 * seconds;
+                let orientation = from.slerp(now.pose.orientation, 0.5);
+                self.ways.push(Way { middle, seconds, velocity, orientation });
             }
         }
         // The middle of the last way is at most so old.
