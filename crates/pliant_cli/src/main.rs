@@ -27,6 +27,7 @@ mod output;
 mod progress;
 mod pull;
 mod report;
+mod simulate;
 mod stability;
 mod stream;
 
@@ -59,6 +60,8 @@ enum Command {
     Drop(drop::DropArgs),
     /// Measures the cost and the errors of the method, as tables and plots
     Report(report::ReportArgs),
+    /// Simulates sessions under faults and attacks, each drawn from a seed
+    Simulate(simulate::SimulateArgs),
     /// Runs stiff, extreme and unfair cases and prints the margin to the bound of each
     Stability(stability::StabilityArgs),
     /// Streams a body over an emulated network and measures the guest's view
@@ -75,6 +78,7 @@ fn main() -> ExitCode {
         Command::Pull(args) => pull::run(&args),
         Command::Drop(args) => drop::run(&args),
         Command::Report(args) => report::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::Stream(args) => stream::run(&args),
     };
@@ -110,6 +114,8 @@ enum CliError {
     Lab(LabError),
     #[error("{broken} of {of} cases break their bounds")]
     Unstable { broken: usize, of: usize },
+    #[error("{broken} of {of} sessions broke; --from SEED --seeds 1 gives one of them again")]
+    Broken { broken: usize, of: u64 },
     #[error("{what}: expected one of {expected}, got '{got}'")]
     Unknown { what: &'static str, got: String, expected: String },
     #[error("{what}: expected {low} to {high}, got {got}")]

@@ -30,6 +30,7 @@
 //! | [`drop`](mod@drop) | what happens to a free body that falls onto the ground or a ball |
 //! | [`report`] | cost and errors of the method, as tables, plots and text |
 //! | [`stability`] | stiff, extreme and unfair cases, each with its bound and its margin |
+//! | [`simulate`](mod@simulate) | whole sessions under faults that a seed draws |
 //! | [`fill`](mod@fill) | tetrahedral meshes from files of any supported kind |
 //! | [`progress`] | progress reports of long measurements |
 
@@ -44,6 +45,7 @@ pub mod pile;
 pub mod progress;
 pub mod pull;
 pub mod report;
+pub mod simulate;
 pub mod stability;
 
 pub use error::LabError;

@@ -12,7 +12,8 @@ use pliant_stream::{
     PeerId, StreamError,
 };
 
-/// The caller's side of the sessions. All methods except [`World::step`] have a default.
+/// The caller's side of the sessions. All methods except [`World::step`] have a default. Each time is
+/// that of the process's own clock ([`Pair::jump_host`], [`Pair::jump_guest`]).
 pub trait World {
     /// Runs the host's step: simulate, then [`HostSession::publish`] every body with this tick.
     fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession);
@@ -29,6 +30,8 @@ pub trait World {
     }
     /// Called after a guest's bodies took `stepped` ticks (0 for a wake-up without a tick).
     fn guest_stepped(&mut self, _now: Duration, _guest: usize, _stepped: u64, _session: &mut GuestSession) {}
+    /// Called with what a guest sends.
+    fn guest_sent(&mut self, _guest: usize, _channel: Channel, _bytes: &[u8]) {}
 }
 
 /// The two directions between the host and one guest.
@@ -62,6 +65,22 @@ pub struct GuestEnd {
     reliable_up: EmulatedLink,
     connected: bool,
     stalled: bool,
+    parted: bool,
+    /// The host that this guest was connected to is gone.
+    lost: bool,
+    /// The guest's clock minus the virtual time.
+    ahead: Duration,
+}
+
+impl GuestEnd {
+    fn send(&mut self, now: Duration, channel: Channel, bytes: Vec<u8>) {
+        let link = match channel {
+            Channel::Datagram => &mut self.up,
+            Channel::Message => &mut self.reliable_up,
+        };
+        let size = bytes.len();
+        link.send(now, bytes, size);
+    }
 }
 
 /// A host and its guests in virtual time.
@@ -78,6 +97,8 @@ pub struct Pair {
     tick: u64,
     paused: bool,
     stalled: bool,
+    /// The host's clock minus the virtual time.
+    ahead: Duration,
     clock: Option<fn() -> Duration>,
     spent: Duration,
 }
@@ -99,6 +120,7 @@ impl Pair {
             tick: 0,
             paused: false,
             stalled: false,
+            ahead: Duration::ZERO,
             clock: None,
             spent: Duration::ZERO,
         })
@@ -147,6 +169,43 @@ impl Pair {
         }
     }
 
+    /// Replaces the host by a new one, as when its process was killed and started again. Its ticks
+    /// begin anew. Nothing passes from and to the guests of before, and they are not told.
+    pub fn restart_host(&mut self, host: HostSession) {
+        self.host = host;
+        self.tick = 0;
+        self.next_step = self.now + self.step;
+        self.guests.iter_mut().for_each(|g| g.lost = true);
+    }
+
+    /// Parts a guest from the host, or joins them again. Datagrams are lost meanwhile, and messages
+    /// wait, since a transport sends them again.
+    pub fn part(&mut self, guest: usize, parted: bool) {
+        if let Some(g) = self.guests.get_mut(guest) {
+            g.parted = parted;
+        }
+    }
+
+    /// Sends bytes to the host over a guest's links, beside what its session sends.
+    pub fn send_as(&mut self, guest: usize, channel: Channel, bytes: Vec<u8>) {
+        let now = self.now;
+        if let Some(g) = self.guests.get_mut(guest).filter(|g| g.connected) {
+            g.send(now, channel, bytes);
+        }
+    }
+
+    /// Lets the host's clock jump ahead.
+    pub fn jump_host(&mut self, by: Duration) {
+        self.ahead += by;
+    }
+
+    /// Lets a guest's clock jump ahead.
+    pub fn jump_guest(&mut self, guest: usize, by: Duration) {
+        if let Some(g) = self.guests.get_mut(guest) {
+            g.ahead += by;
+        }
+    }
+
     /// Joins a guest over a path and returns its index. Reliable messages arrive in order after the
     /// path's delay plus a random delay that stands for resending lost packets.
     ///
@@ -177,7 +236,7 @@ impl Pair {
         let peer = PeerId(index as u64 + 1);
         let mut session = GuestSession::new(config, path.max_datagram)?;
         prepare(&mut session);
-        self.host.connect(self.now, peer, path.max_datagram)?;
+        self.host.connect(self.now + self.ahead, peer, path.max_datagram)?;
         session.connect(self.now)?;
         let reliable = |link: &LinkConfig| LinkConfig {
             jitter: link.jitter
@@ -201,6 +260,9 @@ impl Pair {
             up: EmulatedLink::new(path.up, seed ^ 0xFFFF_0000),
             connected: true,
             stalled: false,
+            parted: false,
+            lost: false,
+            ahead: Duration::ZERO,
         });
         Ok(index)
     }
@@ -221,7 +283,7 @@ impl Pair {
             if !self.paused && !self.stalled && self.now >= self.next_step {
                 self.tick += 1;
                 self.next_step += self.step;
-                world.step(self.now, self.tick, &mut self.host);
+                world.step(self.now + self.ahead, self.tick, &mut self.host);
             }
         }
         self.now = self.now.max(until);
@@ -236,14 +298,15 @@ impl Pair {
                 (a, b) => a.or(b),
             };
         };
-        take(self.host.next_wakeup().filter(|_| !self.stalled));
+        let host = self.host.next_wakeup().map(|t| t.saturating_sub(self.ahead));
+        take(host.filter(|_| !self.stalled));
         for g in self.guests.iter().filter(|g| g.connected) {
-            // What arrives at a process that stalls waits.
+            // What arrives at a process that stalls waits, and messages wait for the network.
             for (link, stalled) in [
                 (&g.down, g.stalled),
-                (&g.reliable_down, g.stalled),
+                (&g.reliable_down, g.stalled || g.parted),
                 (&g.up, self.stalled),
-                (&g.reliable_up, self.stalled),
+                (&g.reliable_up, self.stalled || g.parted),
             ] {
                 take(link.next_wakeup().filter(|_| !stalled));
             }
@@ -252,7 +315,8 @@ impl Pair {
             }
             // Serving a wake-up does not change its time, so the next one must lie later to avoid
             // an endless loop.
-            take(g.session.next_wakeup(self.now).map(|t| t.max(self.now + Duration::from_micros(1))));
+            let later = self.now + Duration::from_micros(1);
+            take(g.session.next_wakeup(self.now + g.ahead).map(|t| t.saturating_sub(g.ahead).max(later)));
         }
         next
     }
@@ -260,19 +324,20 @@ impl Pair {
     /// Delivers everything that has arrived by now, and sends all output.
     fn exchange(&mut self, world: &mut dyn World) {
         let now = self.now;
+        let host_now = now + self.ahead;
         for (index, g) in self.guests.iter_mut().enumerate() {
             let peer = PeerId(index as u64 + 1);
             if !self.stalled {
                 // Poll the reliable link first, so that a snapshot is handled before a frame of the
                 // same arrival time.
-                while let Some(bytes) = g.reliable_up.poll(now) {
-                    if g.connected {
-                        self.host.on_message(now, peer, &bytes);
+                while let Some(bytes) = (!g.parted).then(|| g.reliable_up.poll(now)).flatten() {
+                    if g.connected && !g.lost {
+                        self.host.on_message(host_now, peer, &bytes);
                     }
                 }
                 while let Some(bytes) = g.up.poll(now) {
-                    if g.connected {
-                        self.host.on_datagram(now, peer, &bytes);
+                    if g.connected && !g.lost && !g.parted {
+                        self.host.on_datagram(host_now, peer, &bytes);
                     }
                 }
             }
@@ -280,14 +345,14 @@ impl Pair {
                 continue;
             }
             let began = self.clock.map(|c| c());
-            while let Some(bytes) = g.reliable_down.poll(now) {
+            while let Some(bytes) = (!g.parted).then(|| g.reliable_down.poll(now)).flatten() {
                 if g.connected {
-                    g.session.on_message(now, &bytes);
+                    g.session.on_message(now + g.ahead, &bytes);
                 }
             }
             while let Some(bytes) = g.down.poll(now) {
-                if g.connected {
-                    g.session.on_datagram(now, &bytes);
+                if g.connected && !g.parted {
+                    g.session.on_datagram(now + g.ahead, &bytes);
                 }
             }
             if let (Some(clock), Some(began)) = (self.clock, began) {
@@ -295,29 +360,27 @@ impl Pair {
             }
         }
         if !self.stalled {
-            self.host.update(now);
+            self.host.update(host_now);
             while let Some(event) = self.host.poll_event() {
-                world.host_event(now, event, &mut self.host);
+                world.host_event(host_now, event, &mut self.host);
             }
         }
         for (index, g) in self.guests.iter_mut().enumerate().filter(|(_, g)| g.connected && !g.stalled) {
+            let own = now + g.ahead;
             let began = self.clock.map(|c| c());
-            let stepped = g.session.update(now);
+            let stepped = g.session.update(own);
             if let (Some(clock), Some(began)) = (self.clock, began) {
                 self.spent += clock().saturating_sub(began);
             }
             while let Some(event) = g.session.poll_event() {
-                world.guest_event(now, index, event, &mut g.session);
+                world.guest_event(own, index, event, &mut g.session);
             }
-            world.guest_stepped(now, index, stepped, &mut g.session);
+            world.guest_stepped(own, index, stepped, &mut g.session);
             // This update sends the targets that were just set.
-            g.session.update(now);
+            g.session.update(own);
             while let Some(Output { channel, bytes, .. }) = g.session.poll_output() {
-                let link = match channel {
-                    Channel::Datagram => &mut g.up,
-                    Channel::Message => &mut g.reliable_up,
-                };
-                link.send(now, bytes.to_vec(), bytes.len());
+                world.guest_sent(index, channel, &bytes);
+                g.send(now, channel, bytes.to_vec());
             }
         }
         while let Some(Output { peer, channel, bytes }) = self.host.poll_output() {

@@ -1,0 +1,190 @@
+//! Whole sessions under faults, in virtual time: who crashes, stalls, is parted or lies, and when,
+//! follows from a seed, and so does all else.
+//!
+//! The even seeds are a host with guests, the odd ones a mesh of peers. The last of them is
+//! malicious. What must hold is checked in every tick, and once more a while after the last fault.
+
+mod mesh;
+mod mischief;
+mod schedule;
+mod star;
+mod state;
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
+use pliant_mesh::shapes;
+use pliant_modal::{Damping, Element, GrabConfig, ModalModel};
+use serde::Serialize;
+
+pub use schedule::{Fault, FaultKind};
+
+use crate::{LabError, Progress};
+
+/// When the faults may begin: everybody is there by the first, and the last one is over some
+/// seconds after the second.
+const FAULTS: [Duration; 2] = [Duration::from_secs(4), Duration::from_secs(16)];
+/// Until when faults may last.
+const HEALED: Duration = Duration::from_secs(22);
+/// The end. Who was lost has been noticed, has come back and sees what all see.
+const END: Duration = Duration::from_secs(40);
+/// Silence after which a connection counts as gone. Shorter than by default, so that partitions and
+/// clock jumps exceed it.
+const IDLE: Duration = Duration::from_secs(3);
+/// Time between two looks at what is due.
+const LOOK: Duration = Duration::from_millis(5);
+/// The spring of an honest hand, N/m.
+const SPRING: f64 = 50.0;
+/// Largest force that an honest hand may be told of, N. It is the limit of a guest's hands by
+/// default.
+const MAX_FORCE: f64 = 1000.0;
+/// Largest difference after the end of all faults, as a share of the largest shape.
+const AGREES: f64 = 0.02;
+
+/// What to simulate.
+#[derive(Debug, Clone, Copy)]
+pub struct SimulateSettings {
+    /// The first seed.
+    pub from: u64,
+    /// Number of seeds.
+    pub seeds: u64,
+}
+
+/// A seed whose session broke what must hold.
+#[derive(Debug, Clone, Serialize)]
+pub struct Failure {
+    /// The seed, which gives the same session again.
+    pub seed: u64,
+    /// What did not hold, and when.
+    pub what: String,
+    /// The faults of the session, one a line.
+    pub schedule: Vec<String>,
+}
+
+/// What was simulated.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct SimulateReport {
+    /// Number of sessions.
+    pub seeds: u64,
+    /// Ticks of all hosts and peers.
+    pub ticks: u64,
+    /// Virtual time of all sessions, s.
+    pub virtual_seconds: f64,
+    /// Number of faults by kind.
+    pub faults: BTreeMap<&'static str, u64>,
+    /// Largest reaction that a guest's hand was told of, over the largest true one of its session.
+    pub largest_share: f64,
+    /// What broke.
+    pub failures: Vec<Failure>,
+    /// Running time, s.
+    pub seconds: f64,
+}
+
+/// What one session gives.
+#[derive(Debug, Default)]
+struct Outcome {
+    ticks: u64,
+    share: f64,
+}
+
+/// Simulates the sessions of some seeds, on all cores.
+///
+/// # Errors
+/// Returns [`LabError::Bake`] when the body cannot be made. What breaks in a session is in the
+/// report.
+pub fn simulate(settings: &SimulateSettings, progress: &mut dyn Progress) -> Result<SimulateReport, LabError> {
+    use rayon::prelude::*;
+    let began = Instant::now();
+    let model = body()?;
+    let mut report = SimulateReport { seeds: settings.seeds, ..SimulateReport::default() };
+    // In chunks, so that progress can be reported.
+    let end = settings.from.saturating_add(settings.seeds);
+    let mut next = settings.from;
+    while next < end {
+        let until = next.saturating_add(64).min(end);
+        let done: Vec<_> = (next..until).into_par_iter().map(|seed| (seed, session(seed, &model))).collect();
+        for (seed, (faults, outcome)) in done {
+            report.virtual_seconds += END.as_secs_f64();
+            for fault in &faults {
+                *report.faults.entry(fault.kind.name()).or_default() += 1;
+            }
+            match outcome {
+                Ok(outcome) => {
+                    report.ticks += outcome.ticks;
+                    report.largest_share = report.largest_share.max(outcome.share);
+                }
+                Err(what) => {
+                    let schedule = faults.iter().map(ToString::to_string).collect();
+                    report.failures.push(Failure { seed, what, schedule });
+                }
+            }
+        }
+        next = until;
+        progress.report("simulate", (next - settings.from) as f64 / settings.seeds.max(1) as f64);
+    }
+    report.seconds = began.elapsed().as_secs_f64();
+    Ok(report)
+}
+
+/// The session of a seed.
+fn session(seed: u64, model: &Arc<ModalModel>) -> (Vec<Fault>, Result<Outcome, String>) {
+    let mut random = schedule::Random::new(seed);
+    let processes = 3 + random.index(2);
+    let faults = schedule::schedule(&mut random, processes, FAULTS[0], FAULTS[1]);
+    let run = || match seed % 2 {
+        0 => star::run(model, seed, processes, &faults, random.clone()),
+        _ => mesh::run(model, seed, processes, &faults, random.clone()),
+    };
+    let outcome = catch_unwind(AssertUnwindSafe(run)).unwrap_or_else(|panic| {
+        let text = panic.downcast_ref::<String>().map(String::as_str);
+        let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no text");
+        Err(format!("a panic: {text}"))
+    });
+    (faults, outcome)
+}
+
+/// A bar of a meter that is held at one end.
+fn body() -> Result<Arc<ModalModel>, LabError> {
+    let config = BakeConfig {
+        element: Element::Tet4,
+        modes: 10,
+        young: 1e5,
+        poisson: 0.3,
+        density: 100.0,
+        damping: Damping::Ratio(0.05),
+        anchors: vec![Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 }],
+        ..BakeConfig::default()
+    };
+    Ok(Arc::new(bake(&shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?, None, &config, &mut |_, _| ())?.model))
+}
+
+/// The surface vertex that a process holds, and where its hand is at a time: on a circle of 8 cm
+/// beside the vertex.
+fn hand(model: &ModalModel, process: usize, now: Duration) -> (u32, [f64; 3]) {
+    let positions = model.surface().positions();
+    let at = 1.0 - 0.2 * process as f32;
+    let away = |p: &[f32; 3]| (p[0] - at).powi(2) + (p[1] - 0.2).powi(2) + (p[2] - 0.2).powi(2);
+    let vertex = (0..positions.len()).min_by(|a, b| away(&positions[*a]).total_cmp(&away(&positions[*b])));
+    let vertex = vertex.unwrap_or(0);
+    let [x, y, z] = positions[vertex].map(f64::from);
+    let angle = (1.0 + 0.3 * process as f64) * now.as_secs_f64();
+    let target = [x, y + 0.08 * angle.sin(), z + 0.08 * (1.0 - angle.cos())];
+    (u32::try_from(vertex).unwrap_or(0), target)
+}
+
+/// How honest hands hold.
+fn hold() -> GrabConfig {
+    GrabConfig { stiffness: Some(SPRING), ..GrabConfig::default() }
+}
+
+fn norm(x: [f64; 3]) -> f64 {
+    x.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+/// Distance of two sets of modal coordinates.
+fn apart(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
