@@ -556,6 +556,29 @@ fn clocks_that_differ_by_years_change_nothing_among_peers() {
 }
 
 #[test]
+fn a_peer_that_stalls_for_two_seconds_catches_up_within_one() {
+    let mut mesh = Mesh::new(3, &LinkConfig { delay: 30 * MS, ..LinkConfig::default() }, 3);
+    (0..3).for_each(|k| mesh.start(k, LateInputRepair::Rollback, true));
+    mesh.run(4 * S);
+    // Its process stands still, and what arrives is lost.
+    let stalled = mesh.peers[1].take();
+    mesh.run(6 * S);
+    mesh.peers[1] = stalled;
+    let behind = |mesh: &Mesh| {
+        let tick = |k: usize| mesh.peers[k].as_ref().unwrap().tick();
+        tick(0) - tick(1).min(tick(0))
+    };
+    assert!(behind(&mesh) > 70, "{}", behind(&mesh));
+    mesh.run(7 * S);
+    assert!(behind(&mesh) <= 8, "{} ticks behind after a second", behind(&mesh));
+    mesh.run(9 * S);
+    let left = mesh.events.iter().any(|(_, event)| matches!(event, PeerEvent::Left { .. }));
+    assert!(!left, "nobody has left");
+    let off = mesh.agree(0, 1);
+    assert!(off < 1e-6, "{off}");
+}
+
+#[test]
 fn a_peer_that_dies_lets_go() {
     let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper3), 9);
     for k in 0..3 {
