@@ -12,7 +12,7 @@ use pliant_stream::{BodyId, Channel, DisconnectReason, Output, PeerId, StepSetti
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::{Processes, disturbed, network};
-use super::{AGREES, END, Fault, FaultKind, IDLE, LOOK, MAX_FORCE, Outcome, apart, hand, hold, norm};
+use super::{AGREES, END, Fault, FaultKind, HEALED, IDLE, LOOK, MAX_FORCE, Outcome, apart, hand, hold, norm};
 
 const BODY: BodyId = BodyId(1);
 /// Ticks that may lie between two peers, or between a peer and its newest final tick, at the end.
@@ -129,7 +129,13 @@ pub(super) fn run(
         while let Some(fault) = faults.next_if(|fault| fault.at <= mesh.now) {
             mesh.begin(*fault);
         }
-        for process in 0..count {
+        if mesh.now >= HEALED {
+            // Who was sent away by some and not by others makes them differ for as long as it is
+            // there.
+            mesh.nodes[count - 1].session = None;
+        }
+        let present = if mesh.now < HEALED { count } else { count - 1 };
+        for process in 0..present {
             mesh.turn(process)?;
         }
         mesh.now += LOOK;

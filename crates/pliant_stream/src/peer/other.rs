@@ -36,6 +36,8 @@ pub(super) struct RemotePeer {
     pub(super) ahead: Option<f64>,
     /// The same mean as the other peer reports it, ticks.
     pub(super) theirs: Option<f64>,
+    /// The newest tick that the other peer has told of.
+    pub(super) newest: Tick,
     pub(super) requested: BTreeMap<Tick, Duration>,
     /// Number of consecutive checks that disagreed, per body.
     pub(super) mismatched: BTreeMap<BodyId, u32>,
@@ -70,6 +72,7 @@ impl RemotePeer {
             way: None,
             ahead: None,
             theirs: None,
+            newest: 0,
             requested: BTreeMap::new(),
             mismatched: BTreeMap::new(),
             lost: false,

@@ -13,7 +13,7 @@ use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
 use super::other::{Hello, RemotePeer};
 use crate::StreamError;
-use crate::link::Events;
+use crate::link::{Budget, Events};
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range, next_free};
 use crate::wire::{
@@ -31,6 +31,10 @@ const CHECK_EVERY: u64 = 16;
 const CHECK_TOLERANCE: f64 = 1e-3;
 /// Largest share by which a peer's step is stretched or shortened to match the other peers' ticks.
 const SLEW: f64 = 0.01;
+/// Number of ticks behind all others from which on a peer catches up by steps of its own.
+const BEHIND: u64 = 8;
+/// Largest number of steps in an update.
+const STEPS: u64 = 8;
 /// Pause between requests for the same tick.
 const REQUEST_AGAIN: Duration = Duration::from_millis(150);
 
@@ -48,6 +52,10 @@ pub struct PeerSession {
     tick: Tick,
     started: bool,
     next_step: Option<Duration>,
+    /// This peer was behind all others and steps until it is not.
+    catches_up: bool,
+    /// Budget of the ticks by which the others may hurry this peer.
+    hurry_budget: Budget,
     rollback_from: Option<Tick>,
     /// The tick of the last state taken. Rollback never goes to an earlier tick.
     taken: Tick,
@@ -88,7 +96,6 @@ impl PeerSession {
             inputs.expect(config.user, 1);
         }
         Ok(Self {
-            config,
             others: BTreeMap::new(),
             addresses: BTreeMap::new(),
             bodies: BTreeMap::new(),
@@ -98,6 +105,9 @@ impl PeerSession {
             tick: 0,
             started,
             next_step: None,
+            catches_up: false,
+            // A stall of a bit longer than the idle timeout at once, and a fifth more ticks for ever.
+            hurry_budget: Budget::new(0.2 / config.step, 12.0 / config.step),
             rollback_from: None,
             taken: 0,
             out: VecDeque::new(),
@@ -105,6 +115,7 @@ impl PeerSession {
             requested: None,
             last_check: None,
             gone: LinkStats::default(),
+            config,
         })
     }
 
@@ -451,6 +462,7 @@ impl PeerSession {
         match datagram {
             Datagram::Inputs(Inputs { now: theirs, ahead: seen, ticks, check }) => {
                 other.theirs = seen.or(other.theirs);
+                other.newest = other.newest.max(theirs);
                 other.came(now, theirs as f64 * self.config.step);
                 let sample = self.tick as f64 - theirs as f64;
                 if sample.abs() < WINDOW as f64 {
@@ -560,16 +572,17 @@ impl PeerSession {
         let mut stepped = 0;
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
         let mut due = due;
-        while due <= now && stepped < 8 {
+        while due <= now && stepped < STEPS {
             self.step();
             stepped += 1;
             due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
-            if stepped == 8 && due <= now {
-                // After a long sleep the missed ticks are not stepped one by one. The drift
-                // correction brings this peer back to the others.
+            if stepped == STEPS && due <= now {
+                // The clock does not tell a stall from a jump of its own. What the others tell of
+                // says how many ticks were missed.
                 due = now + Duration::from_secs_f64(self.config.step);
             }
         }
+        stepped += self.catch_up(now, STEPS - stepped);
         self.next_step = Some(due);
         self.ask(now);
         self.give_states(now);
@@ -713,6 +726,27 @@ impl PeerSession {
         if self.others.values().any(RemotePeer::is_apart) {
             self.request_state(now);
         }
+    }
+
+    /// Steps up to `most` ticks that this peer lacks, if every other one is well ahead. Then this is
+    /// the one that has stalled. Returns the number of ticks.
+    fn catch_up(&mut self, now: Duration, most: u64) -> u64 {
+        // A peer that stalls itself or has told nothing yet does not count as ahead.
+        let others = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
+        let ahead = others.map(|o| o.newest.saturating_sub(self.tick)).min().unwrap_or(0);
+        self.catches_up = ahead > if self.catches_up { 0 } else { BEHIND };
+        if !self.catches_up {
+            return 0;
+        }
+        let mut stepped = 0;
+        while stepped < most.min(ahead) && self.hurry_budget.spend(now, 1.0) {
+            self.step();
+            stepped += 1;
+        }
+        for ahead in self.others.values_mut().filter_map(|o| o.ahead.as_mut()) {
+            *ahead += stepped as f64;
+        }
+        stepped
     }
 
     /// Share by which a step is longer than `step`, to stay with the other peers; positive when

@@ -5,8 +5,8 @@
 //! within a tick, and the copy answers with a force that the body never gives, because the host
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
 //! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
-//! second, until the host has the hand where this guest sent it. Where no frame comes at all, the
-//! reaction fades.
+//! second, until the host has the hand where this guest sent it. The same holds for a second after
+//! another's hand has come or gone. Where no frame comes at all, the reaction fades.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -88,6 +88,15 @@ impl HitchGuard {
         }
     }
 
+    /// Bounds for a second, because another's hand has come or gone: the copy learns of it late. A
+    /// hand that has only just taken hold has no measure, and is not bounded.
+    pub(crate) fn disturb(&mut self, now: Duration) {
+        let held = self.given.iter().filter(|(_, given)| *given > 0.0).count() as u64;
+        if held > self.second / 2 {
+            self.bounded_until = self.bounded_until.max(now + AFTER);
+        }
+    }
+
     /// Returns what a hand is told of a reaction, N.
     pub(crate) fn bound(&self, reaction: [f64; 3]) -> [f64; 3] {
         let reaction = Vector3::from(reaction) * self.share;
@@ -123,6 +132,23 @@ mod tests {
         // Only what was given in the last second counts.
         let given: Vec<Tick> = guard.given.iter().map(|g| g.0).collect();
         assert!(given[0] == 40 && given.len() == 41, "{given:?}");
+    }
+
+    #[test]
+    fn a_hand_that_comes_or_goes_bounds_the_others_that_have_held_for_a_while() {
+        let mut guard = HitchGuard::new(0.025);
+        guard.pass(Duration::ZERO, Duration::ZERO);
+        guard.give(1, 1.0);
+        guard.disturb(Duration::ZERO);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "it has only just taken hold");
+        for tick in 2..=60 {
+            guard.give(tick, 1.0);
+            guard.pass(tick as u32 * 25 * MS, Duration::ZERO);
+        }
+        guard.disturb(1500 * MS);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
+        (60..=101).for_each(|k| guard.pass(k * 25 * MS, Duration::ZERO));
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");
     }
 
     #[test]

@@ -45,6 +45,8 @@ pub struct StreamedBody {
     pub(crate) predicted: Option<PredictedHand>,
     predicts: bool,
     hitches: HitchGuard,
+    /// Digest of the other users' hands at the last tick that was received.
+    other_hands: u64,
     config: RecoveryConfig,
     newmark: Newmark,
     waiting: Vec<TickFrame>,
@@ -80,6 +82,7 @@ impl StreamedBody {
             predicted: None,
             predicts,
             hitches: HitchGuard::new(newmark.h),
+            other_hands: 0,
             config,
             newmark,
             waiting: Vec::new(),
@@ -365,6 +368,15 @@ impl StreamedBody {
                 let own = data.grabs.iter().filter(|g| g.state.key.user == user);
                 let reactions = own.map(|g| Vector3::from(g.state.reaction).norm());
                 self.hitches.give(receiver.tick(), reactions.fold(0.0, f64::max));
+                let others = data.grabs.iter().map(|g| g.state.key).filter(|key| key.user != user);
+                let hands = others.fold(0_u64, |sum, key| {
+                    // A digest, since no list is kept: the numbers of a hand, spread and added.
+                    let number = u64::from(key.user.0) << 16 | u64::from(key.grab);
+                    sum.wrapping_add((number + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15))
+                });
+                if std::mem::replace(&mut self.other_hands, hands) != hands {
+                    self.hitches.disturb(now);
+                }
             }
             if let Some(predicted) = &mut self.predicted {
                 let way = round_trip.as_secs_f64() + self.playout.delay();
