@@ -169,9 +169,10 @@ impl Mesh {
     }
 
     fn begin(&mut self, fault: Fault) {
-        // Somebody has to stay, from whom the others get the state.
+        // Somebody has to stay who is in the session, and from whom the others get the state.
         let others = (0..self.malicious()).filter(|other| *other != fault.process);
-        let alone = others.clone().all(|other| self.processes.is_down(other, self.now));
+        let started = |node: &Node| node.session.as_ref().is_some_and(|session| session.tick() > 0);
+        let alone = !others.clone().any(|other| started(&self.nodes[other]));
         if fault.kind == FaultKind::Crash && alone {
             return;
         }

@@ -13,7 +13,7 @@ use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
 use super::other::{Hello, RemotePeer};
 use crate::StreamError;
-use crate::link::{Budget, Events};
+use crate::link::Events;
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range, next_free};
 use crate::wire::{
@@ -33,6 +33,8 @@ const CHECK_TOLERANCE: f64 = 1e-3;
 const SLEW: f64 = 0.01;
 /// Number of ticks behind all others from which on a peer catches up by steps of its own.
 const BEHIND: u64 = 8;
+/// Largest number of missed ticks that a peer catches up on at once.
+const MAX_MISSED: u64 = 1024;
 /// Largest number of steps in an update.
 const STEPS: u64 = 8;
 /// Pause between requests for the same tick.
@@ -54,8 +56,12 @@ pub struct PeerSession {
     next_step: Option<Duration>,
     /// This peer was behind all others and steps until it is not.
     catches_up: bool,
-    /// Budget of the ticks by which the others may hurry this peer.
-    hurry_budget: Budget,
+    /// Ticks that a stall has cost, or a jump of the own clock. The others may hurry this peer by no
+    /// more than these.
+    missed: u64,
+    /// Ticks by which the others have hurried this peer of late. If they turn out to be behind, it
+    /// waits as many.
+    hurried: u64,
     rollback_from: Option<Tick>,
     /// The tick of the last state taken. Rollback never goes to an earlier tick.
     taken: Tick,
@@ -96,6 +102,7 @@ impl PeerSession {
             inputs.expect(config.user, 1);
         }
         Ok(Self {
+            config,
             others: BTreeMap::new(),
             addresses: BTreeMap::new(),
             bodies: BTreeMap::new(),
@@ -106,8 +113,8 @@ impl PeerSession {
             started,
             next_step: None,
             catches_up: false,
-            // A stall of a bit longer than the idle timeout at once, and a fifth more ticks for ever.
-            hurry_budget: Budget::new(0.2 / config.step, 12.0 / config.step),
+            missed: 0,
+            hurried: 0,
             rollback_from: None,
             taken: 0,
             out: VecDeque::new(),
@@ -115,7 +122,6 @@ impl PeerSession {
             requested: None,
             last_check: None,
             gone: LinkStats::default(),
-            config,
         })
     }
 
@@ -462,7 +468,7 @@ impl PeerSession {
         match datagram {
             Datagram::Inputs(Inputs { now: theirs, ahead: seen, ticks, check }) => {
                 other.theirs = seen.or(other.theirs);
-                other.newest = other.newest.max(theirs);
+                other.newest = theirs;
                 other.came(now, theirs as f64 * self.config.step);
                 let sample = self.tick as f64 - theirs as f64;
                 if sample.abs() < WINDOW as f64 {
@@ -573,16 +579,24 @@ impl PeerSession {
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
         let mut due = due;
         while due <= now && stepped < STEPS {
+            if self.hurried > 0 && self.lead().1 > BEHIND {
+                self.hurried -= 1;
+                due += Duration::from_secs_f64(self.config.step);
+                continue;
+            }
             self.step();
             stepped += 1;
+            self.hurried = self.hurried.saturating_sub(1);
             due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
             if stepped == STEPS && due <= now {
                 // The clock does not tell a stall from a jump of its own. What the others tell of
                 // says how many ticks were missed.
+                let missed = ((now - due).as_secs_f64() / self.config.step) as u64;
+                self.missed = self.missed.saturating_add(missed).min(MAX_MISSED);
                 due = now + Duration::from_secs_f64(self.config.step);
             }
         }
-        stepped += self.catch_up(now, STEPS - stepped);
+        stepped += self.catch_up(STEPS - stepped);
         self.next_step = Some(due);
         self.ask(now);
         self.give_states(now);
@@ -728,25 +742,30 @@ impl PeerSession {
         }
     }
 
-    /// Steps up to `most` ticks that this peer lacks, if every other one is well ahead. Then this is
-    /// the one that has stalled. Returns the number of ticks.
-    fn catch_up(&mut self, now: Duration, most: u64) -> u64 {
-        // A peer that stalls itself or has told nothing yet does not count as ahead.
+    /// By how many ticks every other peer is ahead of this one, and by how many behind, as far as
+    /// they have told.
+    fn lead(&self) -> (u64, u64) {
         let others = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
-        let ahead = others.map(|o| o.newest.saturating_sub(self.tick)).min().unwrap_or(0);
+        let both = others.map(|o| (o.newest.saturating_sub(self.tick), self.tick.saturating_sub(o.newest)));
+        both.reduce(|a, b| (a.0.min(b.0), a.1.min(b.1))).unwrap_or_default()
+    }
+
+    /// Steps up to `most` of the ticks that this peer has missed, if every other one is well ahead.
+    /// Then it was a stall. Returns the number of ticks.
+    fn catch_up(&mut self, most: u64) -> u64 {
+        let (ahead, _) = self.lead();
         self.catches_up = ahead > if self.catches_up { 0 } else { BEHIND };
         if !self.catches_up {
             return 0;
         }
-        let mut stepped = 0;
-        while stepped < most.min(ahead) && self.hurry_budget.spend(now, 1.0) {
-            self.step();
-            stepped += 1;
-        }
+        let ticks = most.min(ahead).min(self.missed);
+        (0..ticks).for_each(|_| self.step());
+        self.missed -= ticks;
+        self.hurried += ticks;
         for ahead in self.others.values_mut().filter_map(|o| o.ahead.as_mut()) {
-            *ahead += stepped as f64;
+            *ahead += ticks as f64;
         }
-        stepped
+        ticks
     }
 
     /// Share by which a step is longer than `step`, to stay with the other peers; positive when
