@@ -261,7 +261,8 @@ impl Mesh {
                         };
                         let side = &mut self.wires[index].sides[at];
                         let node = &mut self.nodes[process];
-                        let Some(session) = node.session.as_mut().filter(|_| side.life == node.life && !parted)
+                        let Some(session) =
+                            node.session.as_mut().filter(|_| side.life == node.life && !parted)
                         else {
                             continue;
                         };
@@ -350,7 +351,9 @@ impl Mesh {
                     use DisconnectReason::{Full, Lost, NumberTaken, Silent};
                     let lost = matches!(reason, Silent | Lost | Full | NumberTaken);
                     let honest = process != malicious && other != malicious;
-                    self.ensure(lost || !honest, || format!("process {other} sends {process} away: {reason}"));
+                    self.ensure(lost || !honest, || {
+                        format!("process {other} sends {process} away: {reason}")
+                    });
                     // The one with the higher number calls.
                     if lost && other < process && other < self.nodes.len() {
                         let at = self.now + Duration::from_millis(self.random.range(500, 1500));
@@ -427,8 +430,12 @@ impl Mesh {
             self.dial(process, other, None);
             self.send(process);
         }
-        let due: Vec<usize> =
-            self.nodes[process].missed.iter().filter(|(_, at)| **at <= now).map(|(other, _)| *other).collect();
+        let due: Vec<usize> = self.nodes[process]
+            .missed
+            .iter()
+            .filter(|(_, at)| **at <= now)
+            .map(|(other, _)| *other)
+            .collect();
         for other in due {
             let at = now + Duration::from_millis(self.random.range(700, 1500));
             self.nodes[process].missed.insert(other, at);
@@ -457,7 +464,9 @@ impl Mesh {
         let newest = all.iter().map(|t| t.0).max().unwrap_or(0);
         for (process, (tick, last)) in all.iter().enumerate() {
             self.ensure(tick + NEAR > newest, || format!("process {process} is at tick {tick} of {newest}"));
-            self.ensure(last + NEAR > *tick, || format!("process {process} knows all up to {last} of {tick}"));
+            self.ensure(last + NEAR > *tick, || {
+                format!("process {process} knows all up to {last} of {tick}")
+            });
         }
         let size = self.nodes.iter().map(|node| node.size).fold(0.0, f64::max);
         for process in honest.skip(1) {

@@ -95,7 +95,10 @@ struct Outcome {
 /// # Errors
 /// Returns [`LabError::Bake`] when the body cannot be made. What breaks in a session is in the
 /// report.
-pub fn simulate(settings: &SimulateSettings, progress: &mut dyn Progress) -> Result<SimulateReport, LabError> {
+pub fn simulate(
+    settings: &SimulateSettings,
+    progress: &mut dyn Progress,
+) -> Result<SimulateReport, LabError> {
     use rayon::prelude::*;
     let began = Instant::now();
     let model = body()?;

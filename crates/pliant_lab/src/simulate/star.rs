@@ -437,12 +437,14 @@ impl Star {
             let name = name(process);
             let number = self.apps.known.get(&name).copied();
             let there = self.pair.host.users().any(|(_, user, n)| *n == *name && Some(user) == number);
-            let session = self.guest[process].and_then(|guest| self.pair.guests.get(guest)).map(|g| &g.session);
+            let session =
+                self.guest[process].and_then(|guest| self.pair.guests.get(guest)).map(|g| &g.session);
             let Some(session) = session.filter(|session| there && session.user() == number) else {
                 return self.apps.ensure(false, || format!("{name} is lost"));
             };
             let others = honest.clone().filter(|other| *other != process);
-            let missing = others.map(super::star::name).find(|other| !session.users().any(|u| u.name == *other));
+            let missing =
+                others.map(super::star::name).find(|other| !session.users().any(|u| u.name == *other));
             let Some(view) = session.body(BODY).filter(|view| view.is_ready()) else {
                 return self.apps.ensure(false, || format!("{name} has no body"));
             };

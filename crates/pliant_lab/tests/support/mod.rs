@@ -5,6 +5,6 @@ pub mod scene;
 
 // Both crates use this one copy. The protocol's tests may not depend on the laboratory.
 #[path = "../../../pliant_stream/tests/support/mod.rs"]
-mod protocol;
+pub mod protocol;
 
 pub use protocol::{bar, direct::random, loose_bar};

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{CHECK_TOLERANCE, MAX_OUT, PeerSession};
+use super::{CHECK_TOLERANCE, MAX_MISSED, MAX_OUT, PeerSession};
 use crate::peer::config::PeerEvent;
 use crate::peer::inputs::WINDOW;
 use crate::peer::other::RemotePeer;
@@ -43,6 +43,8 @@ impl PeerSession {
             self.event(PeerEvent::Resynced { from });
         } else {
             self.started = true;
+            // The state may be old, if somebody's inputs are late.
+            self.missed = theirs.saturating_sub(to).min(MAX_MISSED);
             self.next_step = Some(now + Duration::from_secs_f64(self.config.step));
             self.event(PeerEvent::Started);
         }

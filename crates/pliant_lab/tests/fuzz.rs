@@ -1,0 +1,284 @@
+//! The fuzz targets on a stable compiler: their corpora, and these damaged, for some seconds each.
+//!
+//! `PLIANT_FUZZ_SECONDS` sets the seconds for each target (default 4), and `PLIANT_FUZZ_SEED` where
+//! the damage starts (default 1). What fails is printed in its shortest form.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+#[path = "../../../fuzz/src/lib.rs"]
+mod targets;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use proptest::prelude::*;
+use proptest::test_runner::{Config, RngAlgorithm, TestCaseError, TestRng, TestRunner};
+
+fn corpus(target: &str) -> Vec<Vec<u8>> {
+    let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../fuzz/corpus")).join(target);
+    let mut files: Vec<PathBuf> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    assert!(!files.is_empty(), "{} holds nothing", folder.display());
+    files.iter().map(|file| std::fs::read(file).unwrap()).collect()
+}
+
+fn number(name: &str, default: u64) -> u64 {
+    std::env::var(name).ok().and_then(|text| text.parse().ok()).unwrap_or(default)
+}
+
+/// One of the corpus with some bytes changed, cut, doubled or put before another one; or any bytes.
+fn damaged(corpus: Vec<Vec<u8>>) -> impl Strategy<Value = Vec<u8>> {
+    let one = prop::sample::select(corpus);
+    let bytes = prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..6);
+    let damage =
+        (one.clone(), one, bytes, any::<prop::sample::Index>(), any::<prop::sample::Index>(), 0..6_u8);
+    prop_oneof![
+        9 => damage.prop_map(|(mut first, second, bytes, at, other, how)| {
+            for (at, value) in bytes {
+                if !first.is_empty() {
+                    let at = at.index(first.len());
+                    first[at] = value;
+                }
+            }
+            let (at, other) = (at.index(first.len() + 1), other.index(second.len() + 1));
+            match how {
+                0 => first.truncate(at),
+                1 => {
+                    first.truncate(at);
+                    first.extend_from_slice(&second[other..]);
+                }
+                2 => first.extend_from_within(at..),
+                3 => {
+                    first.splice(at..at, second.iter().copied().take(other));
+                }
+                _ => {}
+            }
+            first
+        }),
+        1 => prop::collection::vec(any::<u8>(), 0..600),
+    ]
+}
+
+/// Runs a target on its corpus and on damaged copies. Returns the number of executions.
+fn run(name: &str, target: fn(&[u8]), lasts: Duration) -> u64 {
+    let corpus = corpus(name);
+    let mut executions = 0;
+    for bytes in &corpus {
+        target(bytes);
+        executions += 1;
+    }
+    let seed = number("PLIANT_FUZZ_SEED", 1);
+    let strategy = damaged(corpus);
+    let (began, mut batch) = (Instant::now(), 0_u64);
+    while began.elapsed() < lasts {
+        let mut bytes = [0; 32];
+        bytes[..8].copy_from_slice(&seed.to_le_bytes());
+        bytes[8..16].copy_from_slice(&batch.to_le_bytes());
+        let config = Config { cases: 64, failure_persistence: None, ..Config::default() };
+        let mut runner = TestRunner::new_with_rng(config, TestRng::from_seed(RngAlgorithm::ChaCha, &bytes));
+        let outcome = runner.run(&strategy, |bytes| {
+            catch_unwind(AssertUnwindSafe(|| target(&bytes))).map_err(|panic| {
+                let text = panic.downcast_ref::<String>().cloned();
+                TestCaseError::fail(text.unwrap_or_else(|| "a panic".to_owned()))
+            })
+        });
+        assert!(outcome.is_ok(), "{name}, seed {seed}: {}", outcome.unwrap_err());
+        executions += 64;
+        batch += 1;
+    }
+    executions
+}
+
+#[test]
+fn no_bytes_panic_a_parser_or_a_session() {
+    let lasts = Duration::from_secs(number("PLIANT_FUZZ_SECONDS", 4));
+    for (name, target) in targets::TARGETS {
+        let executions = run(name, target, lasts);
+        println!("{name}: {executions} executions in {lasts:?}");
+        assert!(executions > 64, "{name}");
+    }
+}
+
+/// Writes the corpora anew: what real sessions send, and small files of every format.
+#[test]
+#[ignore = "writes into the repository"]
+fn corpora_are_written() {
+    use pliant_haptics::{Record, Recorder, Sample, VirtualConfig, Wrench};
+    use pliant_modal::GrabConfig;
+    use pliant_stream::wire::{PROTOCOL_VERSION, PeerBodyState, PeerMessage};
+    use pliant_stream::{
+        Channel, DisconnectReason, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig, PeerId,
+        StepSettings, TickState,
+    };
+    use support::protocol::direct;
+
+    let root = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../fuzz/corpus"));
+    let write = |target: &str, name: &str, bytes: &[u8]| {
+        std::fs::create_dir_all(root.join(target)).unwrap();
+        std::fs::write(root.join(target).join(name), bytes).unwrap();
+    };
+    let kind = |bytes: &[u8]| bytes.first().copied().unwrap_or(0);
+    for policy in ["default", "paper"] {
+        let (mut host, mut guest, mut now) = direct::session(policy);
+        for tick in 60..140 {
+            now += Duration::from_millis(25);
+            direct::publish(&mut host, now, tick);
+            host.update(now);
+            guest.update(now);
+            let sent: Vec<_> = std::iter::from_fn(|| host.poll_output()).collect();
+            let asked: Vec<_> = std::iter::from_fn(|| guest.poll_output()).collect();
+            for (side, out) in sent.iter().map(|o| ("host", o)).chain(asked.iter().map(|o| ("guest", o))) {
+                let target = if out.channel == Channel::Datagram { "datagrams" } else { "messages" };
+                write(target, &format!("{policy}-{side}-{}", kind(&out.bytes)), &out.bytes);
+                write("session", &format!("{policy}-{side}-{}", kind(&out.bytes)), &out.bytes);
+            }
+        }
+    }
+    // A guest that joins without the model, takes hold and lets go.
+    let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
+    host.add_body(direct::BODY, "bar", support::bar(2, 0.05), StepSettings::default()).unwrap();
+    let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
+    host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
+    guest.connect(Duration::ZERO).unwrap();
+    for look in 1..60_u32 {
+        let now = Duration::from_millis(25) * look;
+        let (q, tick) = ([0.01, 0.02], u64::from(look));
+        let state =
+            TickState { tick, q: &q, v: &q, a: &q, z: &[], pose: None, grabs: &[], resting: look > 50 };
+        host.publish(now, direct::BODY, &state).unwrap();
+        match look {
+            20 => drop(guest.begin_grab(now, direct::BODY, 5, 0.1, [1.0; 3], GrabConfig::default())),
+            30 => drop(guest.set_interest(direct::BODY, Some(1))),
+            40 => guest.end_grab(0),
+            _ => {}
+        }
+        host.update(now);
+        guest.update(now);
+        while let Some(out) = guest.poll_output() {
+            if out.channel == Channel::Datagram {
+                host.on_datagram(now, PeerId(1), &out.bytes);
+            } else {
+                write("messages", &format!("guest-{}", kind(&out.bytes)), &out.bytes);
+                host.on_message(now, PeerId(1), &out.bytes);
+            }
+        }
+        while let Some(out) = host.poll_output() {
+            if out.channel == Channel::Datagram {
+                guest.on_datagram(now, &out.bytes);
+            } else {
+                write("messages", &format!("host-{}", kind(&out.bytes)), &out.bytes);
+                guest.on_message(now, &out.bytes);
+            }
+        }
+    }
+    let mut all = direct::peers(Duration::ZERO);
+    for look in 1..40 {
+        direct::pass(&mut all, Duration::from_millis(25 * look), |_, _, bytes| {
+            write("datagrams", &format!("peer-{}", kind(bytes)), bytes);
+        });
+    }
+    let state = PeerBodyState {
+        body: 1,
+        q: vec![0.5; 2],
+        v: vec![0.5; 2],
+        a: vec![0.5; 2],
+        z: Vec::new(),
+        force: vec![0.0; 2],
+        frame: None,
+        pulls: Vec::new(),
+    };
+    for (name, message) in [
+        (
+            "hello",
+            PeerMessage::Hello {
+                version: PROTOCOL_VERSION,
+                user: 2,
+                name: "a peer".into(),
+                address: "somewhere".into(),
+                joining: true,
+                scene: 7,
+            },
+        ),
+        ("welcome", PeerMessage::Welcome { user: 2, others: vec![(3, "elsewhere".into())] }),
+        ("request", PeerMessage::StateRequest),
+        ("state", PeerMessage::State { tick: 7, now: 9, bodies: vec![state] }),
+        ("goodbye", PeerMessage::Goodbye { reason: DisconnectReason::Left }),
+    ] {
+        write("peers", name, &message.encode());
+    }
+    write("traces", "trace", b"12.5\nlost # a comment\n13\n");
+    write("traces", "loss", b"gilbert:9%:4");
+    write("model", "bar", &support::bar(2, 0.05).to_bytes());
+    write("model", "free", &support::loose_bar(2, 0.05).to_bytes());
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+    let stl = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n\
+               endfacet\nendsolid a\n";
+    let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+               element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+    let gltf = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],"meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}],
+        "accessors":[{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}],
+        "bufferViews":[{"buffer":0,"byteLength":36}],"buffers":[{"byteLength":36,
+        "uri":"data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}"#;
+    let msh = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n4\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n$EndNodes\n\
+               $Elements\n1\n1 4 0 1 2 3 4\n$EndElements\n";
+    let vtk = "# vtk DataFile Version 3.0\na\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 4 float\n0 0 0\n1 0 0\n\
+               0 1 0\n0 0 1\nCELLS 1 5\n4 0 1 2 3\nCELL_TYPES 1\n10\n";
+    let medit = "MeshVersionFormatted 2\nDimension 3\nVertices\n4\n0 0 0 0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n\
+                 Tetrahedra\n1\n1 2 3 4 0\nEnd\n";
+    let veg = "*VERTICES\n4 3 0 0\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 0 0 1\n*ELEMENTS\nTET\n1 4 0\n1 1 2 3 4\n";
+    let ron = "(name: \"a\", parts: [(name: \"b\", shape: Sphere(center: (0, 0, 0), radius: 1.0))])";
+    let glb = {
+        let mut json = gltf.as_bytes().to_vec();
+        json.resize(json.len().next_multiple_of(4), b' ');
+        let mut glb = b"glTF\x02\0\0\0".to_vec();
+        glb.extend((json.len() as u32 + 20).to_le_bytes());
+        glb.extend((json.len() as u32).to_le_bytes());
+        glb.extend(b"JSON");
+        glb.extend(json);
+        glb
+    };
+    for (ending, content) in [
+        ("obj", obj.as_bytes()),
+        ("stl", stl.as_bytes()),
+        ("ply", ply.as_bytes()),
+        ("gltf", gltf.as_bytes()),
+        ("glb", &glb),
+        ("msh", msh.as_bytes()),
+        ("vtk", vtk.as_bytes()),
+        ("mesh", medit.as_bytes()),
+        ("veg", veg.as_bytes()),
+        ("ron", ron.as_bytes()),
+    ] {
+        let number = targets::FORMATS.iter().position(|format| *format == ending).unwrap() as u8;
+        let bytes = [&[number], content].concat();
+        let path = std::env::temp_dir().join(format!("pliant-corpus-{}.{ending}", std::process::id()));
+        std::fs::write(&path, content).unwrap();
+        let read = pliant_mesh::io::read(&path);
+        std::fs::remove_file(&path).unwrap();
+        assert!(read.is_ok(), "{ending}: {:?}", read.err());
+        write("meshes", ending, &bytes);
+    }
+    // Grabs, targets, ticks with losses, a pause, and bytes of another session.
+    let mut script = vec![0];
+    for k in [0, 128] {
+        script.extend([6 | k, 1, 140, 120, 128, 0, 0, 8 | k, 0, 150, 130, 110, 0x11, 0x52, 0, 15, 30, 0, 0]);
+    }
+    for (what, target) in [(11, "datagrams"), (12, "messages"), (13, "datagrams"), (14, "messages")] {
+        for piece in corpus(target).iter().filter(|piece| piece.len() < 256).take(6) {
+            script.extend([what, piece.len() as u8]);
+            script.extend(piece);
+            script.push(0);
+        }
+    }
+    script.extend([10, 0, 0, 0]);
+    write("guests", "script", &script);
+    write("mesh", "script", &script);
+    let info = VirtualConfig::touch().info();
+    let mut recorder = Recorder::new(Vec::new(), &info).unwrap();
+    for k in 1..4 {
+        let sample = Sample::at([0.01 * f64::from(k), 0.0, 0.0]);
+        recorder.write(&Record { now: f64::from(k), dt: 1.0, sample, wrench: Wrench::default() }).unwrap();
+    }
+    write("device", "three", &recorder.finish().unwrap());
+}

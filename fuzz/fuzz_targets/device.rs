@@ -1,0 +1,4 @@
+//! Recordings of devices.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| pliant_fuzz::device(bytes));
