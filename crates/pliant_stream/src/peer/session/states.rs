@@ -43,8 +43,9 @@ impl PeerSession {
             self.event(PeerEvent::Resynced { from });
         } else {
             self.started = true;
-            // The state may be old, if somebody's inputs are late.
-            self.missed = theirs.saturating_sub(to).min(MAX_MISSED);
+            // The state may be old if somebody's inputs are late, and so may be the tick of a peer
+            // that has stalled itself.
+            self.missed = (theirs.saturating_sub(to) + WINDOW as u64).min(MAX_MISSED);
             self.next_step = Some(now + Duration::from_secs_f64(self.config.step));
             self.event(PeerEvent::Started);
         }
