@@ -1,5 +1,5 @@
-//! The fuzz targets: any bytes through every parser that takes bytes from outside, and through whole
-//! sessions. A target panics when something is wrong.
+//! The fuzz targets: any bytes through every parser that takes bytes from outside, and through
+//! whole sessions. A target panics when something is wrong.
 //!
 //! cargo-fuzz runs them with libFuzzer, and the test `fuzz` of `pliant_lab` with a stable compiler.
 
@@ -292,7 +292,8 @@ impl Script<'_> {
     }
 }
 
-/// A host with two guests: grabs, messages and datagrams of theirs, losses and pauses, in any order.
+/// A host with two guests: grabs, messages and datagrams of theirs, losses and pauses, in any
+/// order.
 pub fn guests(bytes: &[u8]) {
     let mut script = Script(bytes);
     let mut star = Star::new(2, script.byte().unwrap_or(0));

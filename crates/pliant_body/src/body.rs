@@ -27,10 +27,10 @@ use crate::{Inertia, ModalAsset, VisualState, grab::GrabHold};
 ///
 /// The entity's `GlobalTransform` places the body by a rotation, a translation and a positive,
 /// uniform scale. The scale multiplies lengths and forces. Masses, stiffness (N/m) and frequencies
-/// keep their baked values. Moving the transform of an anchored body, or of an entity above it, moves
-/// its anchors, which the body feels as [`Inertia`]. A free body writes its own motion into its `Transform` in each frame and
-/// must have no parent. Writing the transform of a free body moves the body there and keeps its
-/// velocity.
+/// keep their baked values. Moving the transform of an anchored body, or of an entity above it,
+/// moves its anchors, which the body feels as [`Inertia`]. A free body writes its own motion into
+/// its `Transform` in each frame and must have no parent. Writing the transform of a free body
+/// moves the body there and keeps its velocity.
 ///
 /// A change of a field takes effect at the end of the frame. The shape and the motion are kept if
 /// the model stays the same. A change that cannot make a body is refused once

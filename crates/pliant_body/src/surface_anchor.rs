@@ -71,8 +71,8 @@ fn axes([a, b, c]: &[DVec3; 3]) -> Option<DMat3> {
     Some(DMat3::from_cols(tangent, normal, tangent.cross(normal)))
 }
 
-/// Axes of an entity that sits on a triangle at rest: y along the normal and x nearest to the body's
-/// own, or to its z axis where x is the normal.
+/// Axes of an entity that sits on a triangle at rest: y along the normal and x nearest to the
+/// body's own, or to its z axis where x is the normal.
 fn resting_axes(triangle: &DMat3) -> DMat3 {
     let normal = triangle.y_axis;
     let x = if normal.x.abs() < 0.99 { DVec3::X } else { DVec3::Z };

@@ -1,6 +1,6 @@
 //! Convex hulls and triangle meshes as obstacles.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, btree_map::Entry as Slot};
 use std::sync::Arc;
 
 use bevy::{
@@ -227,17 +227,19 @@ impl Solids {
         scale: DVec3,
     ) -> Option<Result<Arc<Solid>, StepError>> {
         let key = (mesh.id(), hull, scale.to_array().map(f64::to_bits));
-        if !self.entries.contains_key(&key) {
-            let entry = match Source::new(meshes.get(mesh)?, hull) {
-                Err(error) => Entry::Made(Err(error)),
-                Ok(source) => match AsyncComputeTaskPool::try_get() {
-                    Some(pool) => Entry::Making(pool.spawn(async move { Solid::new(&source, scale) })),
-                    None => Entry::Made(Solid::new(&source, scale).map(Arc::new)),
-                },
-            };
-            self.entries.insert(key, (entry, true));
-        }
-        let (entry, used) = self.entries.get_mut(&key)?;
+        let (entry, used) = match self.entries.entry(key) {
+            Slot::Occupied(known) => known.into_mut(),
+            Slot::Vacant(new) => {
+                let entry = match Source::new(meshes.get(mesh)?, hull) {
+                    Err(error) => Entry::Made(Err(error)),
+                    Ok(source) => match AsyncComputeTaskPool::try_get() {
+                        Some(pool) => Entry::Making(pool.spawn(async move { Solid::new(&source, scale) })),
+                        None => Entry::Made(Solid::new(&source, scale).map(Arc::new)),
+                    },
+                };
+                new.insert((entry, true))
+            }
+        };
         *used = true;
         if let Entry::Making(task) = entry {
             let made = block_on(poll_once(task))?;

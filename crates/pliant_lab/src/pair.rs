@@ -12,8 +12,8 @@ use pliant_stream::{
     PeerId, StreamError,
 };
 
-/// The caller's side of the sessions. All methods except [`World::step`] have a default. Each time is
-/// that of the process's own clock ([`Pair::jump_host`], [`Pair::jump_guest`]).
+/// The caller's side of the sessions. All methods except [`World::step`] have a default. Each time
+/// is that of the process's own clock ([`Pair::jump_host`], [`Pair::jump_guest`]).
 pub trait World {
     /// Runs the host's step: simulate, then [`HostSession::publish`] every body with this tick.
     fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession);

@@ -28,8 +28,8 @@ const FLOOD_GRABS: std::ops::Range<u16> = 100..104;
 /// Ticks of the host that are kept to compare with.
 const KEPT: usize = 400;
 /// Largest reaction told over the largest true one, without and with a malicious guest: a fifth
-/// beyond it, and the rounding of the frames. With hands that come, go and jump forty times a second
-/// no prediction is as near.
+/// beyond it, and the rounding of the frames. With hands that come, go and jump forty times a
+/// second no prediction is as near.
 const MAX_SHARE: [f64; 2] = [1.2 + 1e-3, 2.0];
 
 struct Held {

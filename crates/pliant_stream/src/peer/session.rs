@@ -56,8 +56,8 @@ pub struct PeerSession {
     next_step: Option<Duration>,
     /// This peer was behind all others and steps until it is not.
     catches_up: bool,
-    /// Ticks that a stall has cost, or a jump of the own clock. The others may hurry this peer by no
-    /// more than these.
+    /// Ticks that a stall has cost, or a jump of the own clock. The others may hurry this peer by
+    /// no more than these.
     missed: u64,
     /// Ticks by which the others have hurried this peer of late. If they turn out to be behind, it
     /// waits as many.
