@@ -197,10 +197,11 @@ fn write(
     mut readout: ResMut<Readout>,
     mut swing: ResMut<Swing>,
     feels: Res<Feels>,
-    bodies: Query<(&BodyState, &VisualState)>,
-    waiting: Query<(), With<RideOn>>,
+    bodies: Query<(&BodyState, &VisualState, Has<ChildOf>)>,
 ) {
-    for (state, visual) in &bodies {
+    let mut riding = 0;
+    for (state, visual, rides) in &bodies {
+        riding += usize::from(rides);
         let rest = state.model().surface().positions();
         let now = state.positions(visual);
         let way = |(a, b): (&[f32; 3], &[f32; 3])| Vec3::from(*a).distance(Vec3::from(*b));
@@ -210,11 +211,10 @@ fn write(
     }
     readout.0 = format!(
         "inertia       {:5.1}\n\
-         riding        {:5}\n\
+         riding        {riding:5}\n\
          ears swing    {:5.1} cm at most\n\
          jelly swings  {:5.1} cm at most",
         feels.0,
-        bodies.iter().len() - waiting.iter().len(),
         100.0 * swing.ear,
         100.0 * swing.jelly,
     );
