@@ -30,8 +30,8 @@ struct Options {
 }
 
 /// Radius of the circle, m, and speed on it, m/s.
-const CIRCLE: f32 = 0.55;
-const SPEED: f32 = 0.8;
+const CIRCLE: f32 = 0.4;
+const SPEED: f32 = 0.7;
 
 /// Time between two hops, time in the air, s, and the height of a hop, m.
 const EVERY: f32 = 2.0;
@@ -46,7 +46,7 @@ fn main() -> AppExit {
                 .key("left mouse: pull an ear")
                 .key("I: inertia on and off")
                 .key("T: teleport")
-                .look(Look { middle: Vec3::new(0.0, 0.32, 0.0), distance: 2.2, yaw: 0.4, pitch: 0.25 })
+                .look(Look { middle: Vec3::new(0.0, 0.36, 0.0), distance: 1.7, yaw: 0.4, pitch: 0.2 })
                 .picture_at(2.2),
         )
         .add_plugins(PliantPlugins::default())
