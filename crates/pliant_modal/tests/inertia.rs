@@ -65,8 +65,7 @@ fn an_accelerated_body_bends_as_under_the_opposite_gravity() {
 
 #[test]
 fn a_rod_that_spins_about_its_anchor_stretches_as_published() {
-    // E A u'' = -rho A omega^2 x with u(0) = 0 and u'(L) = 0: the tip is at rho omega^2 L^3 / (3
-    // E).
+    // E A u'' = -rho A omega^2 x with u(0) = 0 and u'(L) = 0: rho omega^2 L^3 / (3 E) at the tip.
     let (model, spin) = (Arc::new(rod(YOUNG, 12, 0.4, false)), 2.0);
     let exact = DENSITY * spin * spin * LENGTH.powi(3) / (3.0 * YOUNG);
     for axis in [[0.0, spin, 0.0], [0.0, 0.0, -spin], [0.0, spin * 0.6, spin * 0.8]] {
