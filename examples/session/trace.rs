@@ -185,8 +185,14 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
     let (mut streamed, mut own) = (Off::default(), Off::default());
     let (mut felt, mut force_sum, mut force_worst, mut force_most) = (0u64, 0.0f64, 0.0f64, 0.0f64);
     let host = UserId::HOST.0;
+    // The largest reaction that the user was told of, and the largest true one at any tick.
+    let (mut told, mut owner) = (0.0f64, host);
     let first = shown.keys().filter(|key| key.1 == host).nth(skip).map_or(u64::MAX, |key| key.0);
     for (&(tick, user), line) in shown.range((first, 0)..) {
+        if user != host && line.reaction.is_finite() {
+            told = told.max(f64::from(line.reaction.length()));
+            owner = user;
+        }
         let Some(real) = truth.get(&(tick, host)) else { continue };
         let off = if user == host { &mut streamed } else { &mut own };
         off.add(model, &line.q, &real.q);
@@ -206,9 +212,13 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
     if streamed.ticks == 0 {
         return Err("no tick is in both files".into());
     }
+    let given =
+        truth.range((first, 0)..).filter(|((_, user), line)| *user == owner && line.reaction.is_finite());
+    let given = given.map(|(_, line)| f64::from(line.reaction.length())).fold(0.0, f64::max);
     println!(
         "{} of {span} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
-         predicted hand against the later state of the host, {:.2} % rms",
+         predicted hand against the later state of the host, {:.2} % rms; \
+         largest reaction {told:.2} N shown, {given:.2} N true",
         streamed.ticks,
         streamed.rms(),
         percent(streamed.worst, streamed.largest),

@@ -1,7 +1,7 @@
 //! The host, which steps the body and streams it without a window.
 
 use std::{
-    collections::VecDeque,
+    collections::{BTreeMap, VecDeque},
     sync::{
         Arc, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
@@ -13,7 +13,7 @@ use bevy::{app::ScheduleRunnerPlugin, diagnostic::DiagnosticsStore, prelude::*};
 use pliant::{
     body::{Integrator, STEP_TIME},
     modal::ModalModel,
-    net::{NetHost, NetPlugin, NetStats, SharedBody},
+    net::{HandOf, NetHost, NetPlugin, NetStats, SharedBody, User},
     prelude::*,
 };
 
@@ -33,6 +33,8 @@ pub struct HostReport {
     pub seconds: f64,
     /// Times of the newest steps, us; a resting body is not stepped.
     pub step_us: VecDeque<f64>,
+    /// Largest true reaction on the hands of each user, N, by the user's name.
+    pub reactions: BTreeMap<String, f64>,
 }
 
 /// The report while it grows, and the flag that stops the host.
@@ -96,6 +98,8 @@ fn record(
     shared: Res<Shared>,
     diagnostics: Res<DiagnosticsStore>,
     bodies: Query<&BodyState>,
+    hands: Query<(&GrabForce, &HandOf)>,
+    users: Query<&User>,
     mut since: Local<Option<f64>>,
     mut last: Local<Option<Instant>>,
 ) {
@@ -109,6 +113,11 @@ fn record(
     let begun = *since.get_or_insert(now);
     let mut report = shared.report.lock().unwrap_or_else(PoisonError::into_inner);
     report.ticks += 1;
+    for (force, of) in &hands {
+        let Ok(user) = users.get(of.0) else { continue };
+        let largest = report.reactions.entry(user.name.clone()).or_default();
+        *largest = largest.max(force.force.length());
+    }
     report.bytes_out = stats.bytes_out;
     report.seconds = now - begun;
     if let Some(step) = diagnostics.get_measurement(&STEP_TIME)

@@ -41,7 +41,9 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
     println!("while the local hand holds the body, against the later state of the host at the same tick:");
     errors("  predicted hand", &|g| g.meters.predicted_hand.clone());
     errors("  without prediction", &|g| g.meters.waiting.clone());
-    row("largest reaction, N", &|g| format!("{:.2}", g.meters.reaction));
+    row("largest reaction shown, N", &|g| format!("{:.2}", g.meters.reaction));
+    let largest = |name| host.reactions.get(name).copied().unwrap_or(0.0);
+    println!("{:<42}{:>12.2}{:>12.2}", "largest true reaction, N", largest("you"), largest("other"));
     println!(
         "host: time a step, us: median {:.1}, 99th percentile {:.1}; {:.0} bytes a second sent to both",
         percentile(&step, 0.5),

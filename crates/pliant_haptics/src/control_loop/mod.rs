@@ -4,6 +4,7 @@
 pub(crate) mod core;
 pub(crate) mod coupling;
 pub(crate) mod cycle;
+pub(crate) mod heartbeat;
 pub(crate) mod held_patches;
 pub(crate) mod histogram;
 pub(crate) mod local_body;
@@ -14,3 +15,9 @@ pub(crate) mod scheduler;
 pub(crate) mod supervisor;
 pub(crate) mod tool;
 pub(crate) mod validation;
+
+/// What threads share. Tests put loom's in its place.
+pub(crate) mod sync {
+    pub(crate) use std::sync::Arc;
+    pub(crate) use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
+}

@@ -18,7 +18,8 @@ use crate::{
     LoopReport, LoopState, ModalLocal, RealScheduler, Record, StartError, ToolMap, Wrench,
     control_loop::{
         cycle::Sink,
-        supervisor::{Done, Heartbeat, Phase, supervise},
+        heartbeat::{Done, Heartbeat, Phase},
+        supervisor::supervise,
     },
 };
 
