@@ -155,7 +155,7 @@ faults() {
     sleep 2
 
     kill -9 $gb
-    after=$(wait_for "$work/s1.log" "b is gone" 60)
+    after=$(wait_for "$work/s1.log" "b has left" 60)
     losses=$(seen "$work/fa.log" "lost the connection")
     echo "kill -9 of guest b: the server, after $after s; guest a goes on: $losses losses"
 
@@ -173,7 +173,7 @@ faults() {
     guests=$(seen "$work/s2.log" "has joined")
     echo "server started anew: guest a in again after $after s; the server has $guests guest(s)"
     t0=$(now); kill -INT $ga; wait $ga 2>/dev/null
-    echo "Ctrl-C at guest a: the server, after $(wait_for "$work/s2.log" "a is gone" 60) s"
+    echo "Ctrl-C at guest a: the server, after $(wait_for "$work/s2.log" "a has left" 60) s"
     if grep -qE "ERROR|panicked" "$work"/*.log; then
         echo "errors in the logs:"
         grep -hE "ERROR|panicked" "$work"/*.log | head -5

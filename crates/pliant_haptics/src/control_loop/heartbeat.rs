@@ -61,7 +61,8 @@ impl Heartbeat {
 
     /// Marks the force as cut. The loop learns of it by its next sign of life.
     pub(crate) fn mark_cut(&self) {
-        self.cut.store(true, Ordering::Release);
+        // A swap, and no store: loom does not order a store against the swap of a sign of life.
+        self.cut.swap(true, Ordering::AcqRel);
     }
 
     pub(crate) fn is_done(&self) -> bool {
