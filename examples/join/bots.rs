@@ -29,9 +29,6 @@ pub struct Bots {
     pub stopped: Arc<AtomicBool>,
 }
 
-/// Tag of session messages in `pliant_net`.
-const SESSION: u8 = 0;
-
 struct Bot {
     endpoint: Endpoint,
     session: Option<GuestSession>,
@@ -151,9 +148,8 @@ impl Bot {
                 }
                 Event::Message { bytes, .. } => {
                     self.bytes += bytes.len() as u64;
-                    if let (Some((&SESSION, bytes)), Some(session)) = (bytes.split_first(), &mut self.session)
-                    {
-                        session.on_message(now, bytes);
+                    if let Some(session) = &mut self.session {
+                        session.on_message(now, &bytes);
                     }
                 }
                 Event::Closed { reason, .. } => self.closed = Some(reason.to_string()),
@@ -190,9 +186,7 @@ impl Bot {
                     self.endpoint.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)).ok();
                 }
                 Channel::Message => {
-                    let message: Bytes =
-                        std::iter::once(SESSION).chain(output.bytes.iter().copied()).collect();
-                    self.endpoint.send_message(PeerId::HOST, message).ok();
+                    self.endpoint.send_message(PeerId::HOST, Bytes::from_owner(output.bytes)).ok();
                 }
             }
         }
