@@ -1,7 +1,7 @@
 //! The hand-over between a device loop and its supervisor, in all orders of their steps (loom).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-#[allow(dead_code, reason = "the model uses a part")]
+#[expect(dead_code, reason = "the model uses a part")]
 #[path = "../src/control_loop/heartbeat.rs"]
 mod heartbeat;
 
