@@ -4,8 +4,9 @@
 #
 #   tests/stops.sh [PAUSES...]
 #
-# LIGHT=1 sets no bar on the reaction: nobody may be lost, and nothing may panic. CORES=1 keeps every core busy meanwhile. Binaries: those of BIN, or built by cargo. Ends with 77
-# (skipped) where a tool is missing, and with 1 when a figure is beyond its bar.
+# LIGHT=1 sets no bar on the reaction: nobody may be lost, and nothing may panic. CORES=1 keeps
+# every core busy meanwhile. Binaries: those of BIN, or built by cargo. Ends with 77 (skipped) where
+# a tool is missing, and with 1 when a figure is beyond its bar.
 set -u
 cd "$(dirname "$0")/.."
 skip() { echo "skipped: $1"; exit 77; }
