@@ -190,7 +190,8 @@ impl Ride {
         let felt = self.felt.get_or_insert(velocity);
         for (k, acceleration) in accelerations.iter_mut().enumerate() {
             let change = velocity[k] - felt[k];
-            if change.length() > unsure[k] + 1e-6 * velocity[k].length() {
+            let stopped = velocity[k] == DVec3::ZERO && change != DVec3::ZERO;
+            if stopped || change.length() > unsure[k] + 1e-6 * velocity[k].length() {
                 felt[k] = velocity[k];
                 *acceleration = axes.inverse() * (change / step);
             }

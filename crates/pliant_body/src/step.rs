@@ -192,7 +192,8 @@ pub(crate) fn place_bodies(
             continue;
         }
         let scale = f64::from(scale.x);
-        if scale != state.scale {
+        // Out of a matrix that turns, the scale changes by rounding.
+        if (scale - state.scale).abs() > 1e-5 * scale {
             // The running configuration is the base, because the component's fields may have been
             // refused.
             let mut running = state.body.config().clone();

@@ -14,10 +14,12 @@ use parry3d_f64::{
     math::Vector,
     query::PointQueryWithLocation,
     shape::{TriMesh, TriMeshFlags},
-    transformation::try_convex_hull,
+    transformation::{ConvexHullError, try_convex_hull},
 };
 use pliant_modal as modal;
 use pliant_modal::StepError;
+
+use crate::obstacle::FAR;
 
 /// The triangles of an obstacle in its own axes, m, with the scale of its entity.
 #[derive(Debug)]
@@ -31,7 +33,10 @@ impl Solid {
     /// Distance (m) and normal at a point in the obstacle's axes.
     fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
         let p = Vector::new(point.x, point.y, point.z);
-        let (closest, (triangle, _)) = self.triangles.project_local_point_and_get_location(p, false);
+        let found = self.triangles.project_local_point_and_get_location_with_max_dist(p, false, f64::MAX);
+        let Some((closest, (triangle, _))) = found.filter(|_| p.is_finite()) else {
+            return modal::SurfacePoint { distance: FAR, normal: Vector3::y() };
+        };
         let way = p - closest.point;
         let length = way.length();
         let sign = if closest.is_inside { -1.0 } else { 1.0 };
@@ -59,7 +64,9 @@ impl Solid {
                 expected: "4 or more, not all in one plane",
                 got: points.len() as f64,
             };
-            (points, triangles) = try_convex_hull(&points).map_err(fail)?;
+            // Some of its checks are assertions.
+            let made = std::panic::catch_unwind(|| try_convex_hull(&points).map_err(fail));
+            (points, triangles) = made.unwrap_or_else(|_| Err(fail(ConvexHullError::Unreachable)))?;
         }
         // A closed mesh may have been made inside out, and a mirrored one is.
         let (volume, size) = (volume(&points, &triangles), size(&points));

@@ -90,6 +90,13 @@ enum Shape {
     Solid(Arc<Solid>),
 }
 
+#[cfg(feature = "mesh")]
+impl Shape {
+    fn is_solid(&self) -> bool {
+        matches!(self, Self::Solid(_))
+    }
+}
+
 impl PartialEq for Shape {
     fn eq(&self, other: &Self) -> bool {
         match (self, other) {
@@ -106,7 +113,7 @@ impl PartialEq for Shape {
 #[derive(Component, Debug, Clone, PartialEq)]
 pub(crate) struct Motion {
     shape: Shape,
-    /// Scale of the entity.
+    /// Scale of the entity, negative where it mirrors.
     scale: DVec3,
     position: DVec3,
     rotation: DQuat,
@@ -119,15 +126,20 @@ pub(crate) struct Motion {
 }
 
 impl Motion {
-    /// `solid` gives the shape of a mesh at a scale, when it is known.
+    /// `solid` gives the shape of a mesh at a scale, when it is known. `last` is the motion until
+    /// now.
     fn new(
         shape: &Obstacle,
         global: &GlobalTransform,
+        last: Option<&Self>,
         solid: impl FnOnce(DVec3) -> Option<Shape>,
     ) -> Option<Self> {
         let (scale, rotation, position) = global.to_scale_rotation_translation();
         let sound = scale.is_finite() && rotation.is_finite() && position.is_finite();
         let (scale, position) = (scale.as_dvec3(), position.as_dvec3());
+        // The scale comes out of a matrix, and changes by rounding where the entity turns.
+        let same = |last: &&Self| (scale - last.scale).abs().cmple(1e-5 * scale.abs()).all();
+        let scale = last.filter(same).map_or(scale, |last| last.scale);
         let shape = match shape {
             _ if !sound => return None,
             #[cfg(feature = "mesh")]
@@ -139,7 +151,7 @@ impl Motion {
         };
         Some(Self {
             shape,
-            scale: scale.abs(),
+            scale,
             position,
             rotation: rotation.as_dquat().normalize(),
             velocity: DVec3::ZERO,
@@ -175,7 +187,7 @@ impl Motion {
     /// Calls `visit` with the obstacle in the world of a body on an entity of uniform scale
     /// `scale`.
     fn visit<V: Visit>(&self, scale: f64, visit: V) -> V::Output {
-        let whole = self.scale.max_element() / scale;
+        let whole = self.scale.abs().max_element() / scale;
         let center = [0.0; 3];
         let plain = match &self.shape {
             Shape::Plain(plain) => plain,
@@ -194,7 +206,7 @@ impl Motion {
                 visit.visit(self.moving(modal::Sphere { center, radius }, scale))
             }
             Obstacle::Box { half } => {
-                let half = (half.as_dvec3() * self.scale / scale).into();
+                let half = (half.as_dvec3() * self.scale.abs() / scale).into();
                 let shape = modal::Cuboid { center, rotation: [0.0, 0.0, 0.0, 1.0], half, round: 0.0 };
                 visit.visit(self.moving(shape, scale))
             }
@@ -245,13 +257,17 @@ impl Visit for Distance<'_> {
     }
 }
 
+/// Distance that is no distance at all, m: of an obstacle that is not there, and of a point that is
+/// too far away for numbers.
+pub(crate) const FAR: f64 = 1e30;
+
 /// Stands for an obstacle that is not there.
 #[derive(Debug)]
 pub(crate) struct Nothing;
 
 impl modal::ObstacleShape for Nothing {
     fn at(&self, _: &Vector3<f64>) -> modal::SurfacePoint {
-        modal::SurfacePoint { distance: 1e30, normal: Vector3::y() }
+        modal::SurfacePoint { distance: FAR, normal: Vector3::y() }
     }
 }
 
@@ -310,12 +326,14 @@ pub(crate) fn move_obstacles(
         // `GlobalTransform` is that of the last frame.
         let global = transforms.compute_global_transform(entity).ok();
         #[cfg(feature = "mesh")]
-        let solid = |scale| match meshes.find(shape, scale)? {
-            Ok(solid) => {
+        let solid = |scale| match meshes.find(shape, scale) {
+            // What was there stays until the new one is made.
+            None => motion.as_ref().map(|last| last.shape.clone()).filter(Shape::is_solid),
+            Some(Ok(solid)) => {
                 unsound.remove(&entity);
                 Some(solid)
             }
-            Err(error) => {
+            Some(Err(error)) => {
                 if unsound.insert(entity) {
                     warn!("{entity}: {error}");
                     refused.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
@@ -325,7 +343,7 @@ pub(crate) fn move_obstacles(
         };
         #[cfg(not(feature = "mesh"))]
         let solid = |_| None;
-        let mut now = global.and_then(|global| Motion::new(shape, &global, solid));
+        let mut now = global.and_then(|global| Motion::new(shape, &global, motion.as_deref(), solid));
         if let (Some(now), Some(last)) = (&mut now, &motion) {
             *now = now.clone().after(last, step);
         }

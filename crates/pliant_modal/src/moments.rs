@@ -48,9 +48,13 @@ impl Moments {
         });
         // Products of columns have the same bits on every processor, unlike those of matrices.
         let product = |a: &DMatrix<f64>, i: usize, b: &DMatrix<f64>, j: usize| a.column(i).dot(&b.column(j));
-        let gram = DMatrix::from_fn(modes, modes, |i, j| {
-            product(&shapes, i.min(j), &shapes, i.max(j)) + if i == j { Self::RIDGE } else { 0.0 }
-        });
+        let mut gram = DMatrix::zeros(modes, modes);
+        for i in 0..modes {
+            for j in 0..=i {
+                let sum = product(&shapes, j, &shapes, i) + if i == j { Self::RIDGE } else { 0.0 };
+                (gram[(i, j)], gram[(j, i)]) = (sum, sum);
+            }
+        }
         let right = DMatrix::from_fn(modes, 9, |mode, field| product(&shapes, mode, &fields, field));
         // A surface without area gives no numbers, and a model without moments still bends as it
         // is accelerated.

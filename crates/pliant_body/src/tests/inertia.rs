@@ -236,6 +236,37 @@ fn a_body_at_rest_on_a_still_entity_stays_at_rest() {
 }
 
 #[test]
+fn a_body_comes_to_rest_after_its_entity_has_turned_to_a_stop() {
+    for by in [By::Ticks, By::Frames] {
+        let mut app = moving_app(by, 60.0);
+        let parent = app.world_mut().spawn((Transform::default(), Visibility::default())).id();
+        let body = spawn(&mut app, model::bar(), ChildOf(parent));
+        run(&mut app, 60.0, 0.5);
+        // It slows down so gently that the last changes of its velocity are below what single
+        // precision tells.
+        let eased = |t: f64| {
+            let s = (t / 4.0).clamp(0.0, 1.0);
+            (DVec3::ZERO, 0.3 * s * s * s * (10.0 - 15.0 * s + 6.0 * s * s))
+        };
+        app.world_mut().entity_mut(parent).insert(Course(eased));
+        run(&mut app, 60.0, 40.0);
+        assert!(state(&app, body).is_resting());
+    }
+}
+
+#[test]
+fn nothing_rides_on_what_rides_on_it() {
+    let mut app = moving_app(By::Ticks, 64.0);
+    let body = spawn(&mut app, model::bar(), ());
+    let child = app.world_mut().spawn((Name::new("Head"), ChildOf(body), Transform::default())).id();
+    for root in [body, child] {
+        app.world_mut().entity_mut(body).insert(RideOn { root, name: "Head".into() });
+        run(&mut app, 64.0, 0.1);
+        assert!(app.world().get::<ChildOf>(body).is_none());
+    }
+}
+
+#[test]
 fn a_turn_has_the_shorter_of_two_ways() {
     // A quaternion and its opposite are the same rotation.
     let step = 0.01;
@@ -269,9 +300,10 @@ fn a_body_rides_on_a_bone_by_its_name() {
             .spawn((Name::new(name.to_owned()), ChildOf(parent), place, Visibility::default()))
             .id()
     };
-    let spine = joint(&mut app, "Spine", character, 1.0);
-    let neck = joint(&mut app, "Neck", spine, 0.5);
-    let head = joint(&mut app, "Head", neck, 0.2);
+    // Near enough that the way there is slower than what counts as a teleport by itself.
+    let spine = joint(&mut app, "Spine", character, 0.1);
+    let neck = joint(&mut app, "Neck", spine, 0.05);
+    let head = joint(&mut app, "Head", neck, 0.05);
     let skin =
         bevy::mesh::skinning::SkinnedMesh { inverse_bindposes: default(), joints: vec![spine, neck, head] };
     app.world_mut().spawn((skin, ChildOf(character), Transform::default(), Visibility::default()));
@@ -280,9 +312,9 @@ fn a_body_rides_on_a_bone_by_its_name() {
     assert!(app.world().get::<RideOn>(body).is_none());
     assert_eq!(state(&app, body).body().energy(), 0.0, "to be put in place is no motion");
     let origin = DVec3::from(state(&app, body).body().frame().origin());
-    assert!((origin - DVec3::new(0.0, 1.8, 0.0)).length() < 1e-5, "{origin}");
+    assert!((origin - DVec3::new(0.0, 0.3, 0.0)).length() < 1e-5, "{origin}");
     // The body feels the neck nod.
-    app.world_mut().entity_mut(neck).insert(Course(|t| (DVec3::Y * 0.5, 0.5 * (6.0 * t).sin())));
+    app.world_mut().entity_mut(neck).insert(Course(|t| (DVec3::Y * 0.05, 0.5 * (6.0 * t).sin())));
     run(&mut app, 64.0, 1.0);
     assert!(state(&app, body).body().energy() > 1e-3);
     app.world_mut().entity_mut(character).despawn();

@@ -7,7 +7,7 @@ use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_stream::peer::PeerEvent;
 use pliant_stream::wire::PeerMessage;
-use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
+use pliant_stream::{Channel, DisconnectReason, PeerId, StreamError, UserId};
 
 use super::reconnect::may_come_back;
 use super::{NetPeer, PeerState};
@@ -109,7 +109,9 @@ impl NetPeer {
         };
         if let Err(error) = added {
             debug!("peer {peer}: {error}");
-            return self.hang_up(peer, DisconnectReason::Full);
+            let is_small = matches!(error, StreamError::Config { what: "datagram size", .. });
+            let reason = if is_small { DisconnectReason::SmallDatagrams } else { DisconnectReason::Full };
+            return self.hang_up(peer, reason);
         }
         if let Some(bytes) = other.first.take() {
             session.on_message(now, peer, &bytes);
