@@ -1,4 +1,4 @@
-//! Sessions under faults keep what must hold, and a seed gives the same session again.
+//! Sessions under faults keep what must hold.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_lab::simulate::{FaultKind, SimulateSettings, simulate};

@@ -465,7 +465,8 @@ impl Body {
     /// would leave the body behind by more than its size in one step counts as one that does not. A
     /// free body ignores the motion, because its frame is its own.
     ///
-    /// The first call finds the moments of the model, which takes some milliseconds.
+    /// The first call finds the moments of the model, which takes some milliseconds for 60 modes,
+    /// and time that grows with the square of their number.
     ///
     /// # Errors
     /// Returns an error if a number is not finite. The motion then stays as it was.
