@@ -228,7 +228,8 @@ pub(crate) fn begin_tick(
     transforms: TransformHelper,
     mut rides: Query<(Entity, &mut Ride), With<BodyState>>,
 ) {
-    for (entity, mut ride) in &mut rides {
+    // Bodies that feel no motion are not looked at.
+    for (entity, mut ride) in rides.iter_mut().filter(|(_, ride)| ride.last.is_some()) {
         let Ok(now) = transforms.compute_global_transform(entity) else { continue };
         ride.outside |= ride.left.is_some_and(|left| !is_same(&left, &now.affine()));
     }
@@ -236,7 +237,7 @@ pub(crate) fn begin_tick(
 
 /// Notes where the entities are at the end of a tick.
 pub(crate) fn end_tick(transforms: TransformHelper, mut rides: Query<(Entity, &mut Ride), With<BodyState>>) {
-    for (entity, mut ride) in &mut rides {
+    for (entity, mut ride) in rides.iter_mut().filter(|(_, ride)| ride.last.is_some()) {
         ride.left = transforms.compute_global_transform(entity).ok().map(|now| now.affine());
     }
 }
@@ -264,11 +265,16 @@ pub(crate) fn ride(
     let frame = frames.elapsed_secs_f64() - frames.delta_secs_f64();
     for (name, inertia, driven, mut ride, mut state) in &mut bodies {
         let factor = inertia.factor();
+        if *driven != Driven::Local || state.model().is_free() || factor <= 0.0 {
+            if ride.last.is_some() {
+                *ride = Ride::default();
+            }
+            continue;
+        }
         let global = transforms.compute_global_transform(name.entity).ok();
         let (affine, pose) = global.as_ref().map(place).unzip();
         let pose = pose.filter(|pose| pose.origin.is_finite() && pose.orientation.is_finite());
-        let felt = *driven == Driven::Local && !state.model().is_free() && factor > 0.0;
-        let (Some(affine), Some(pose), true) = (affine, pose, felt) else {
+        let (Some(affine), Some(pose)) = (affine, pose) else {
             *ride = Ride::default();
             continue;
         };
