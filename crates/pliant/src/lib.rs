@@ -22,6 +22,7 @@
 //! | Plugin | What it does | Without it |
 //! | --- | --- | --- |
 //! | [`PliantBodyPlugin`](body::PliantBodyPlugin) | `.modal` assets, [`ModalBody`](body::ModalBody), grabs, the fixed step, the deformed surface | no other plugin works |
+//! | [`RidingPlugin`](body::RidingPlugin) | bodies feel how their entities move, ride on bones and carry things | nothing rides |
 //! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | pointers drag bodies (feature `picking`) | only code makes grabs |
 #![cfg_attr(
     feature = "contact",
@@ -143,7 +144,9 @@ impl Default for PliantPlugins {
 
 impl PluginGroup for PliantPlugins {
     fn build(self) -> PluginGroupBuilder {
-        let group = PluginGroupBuilder::start::<Self>().add(body::PliantBodyPlugin::new(self.schedule));
+        let group = PluginGroupBuilder::start::<Self>()
+            .add(body::PliantBodyPlugin::new(self.schedule))
+            .add(body::RidingPlugin::new(self.schedule));
         #[cfg(feature = "picking")]
         let group = group.add(body::PointerGrabPlugin);
         #[cfg(feature = "contact")]
@@ -160,8 +163,8 @@ pub mod prelude {
     pub use crate::body::{
         BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Impulse, Inertia, Integrator,
         ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems,
-        PliantTick, Push, Relaxation, RideOn, SingleSteps, StepSettings, SurfaceAnchor, SurfacePlace,
-        Teleport, VisualState,
+        PliantTick, Push, Relaxation, RideOn, RidingPlugin, SingleSteps, StepSettings, SurfaceAnchor,
+        SurfacePlace, Teleport, VisualState,
     };
     #[cfg(feature = "picking")]
     pub use crate::body::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};

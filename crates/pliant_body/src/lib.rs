@@ -61,6 +61,7 @@ mod picking;
 #[cfg(feature = "picking")]
 mod pointer;
 mod ride_on;
+mod riding;
 mod step;
 mod surface_anchor;
 #[cfg(test)]
@@ -93,6 +94,7 @@ pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSetting
 #[cfg(feature = "picking")]
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use ride_on::RideOn;
+pub use riding::RidingPlugin;
 pub use step::PliantTick;
 pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
 pub use visual::{Pose, VisualState};
@@ -166,19 +168,23 @@ impl Default for PliantBodyPlugin {
     }
 }
 
+/// Returns whether a schedule belongs to the fixed loop.
+fn is_fixed(schedule: InternedScheduleLabel) -> bool {
+    [
+        FixedFirst.intern(),
+        FixedPreUpdate.intern(),
+        FixedUpdate.intern(),
+        FixedPostUpdate.intern(),
+        FixedLast.intern(),
+    ]
+    .contains(&schedule)
+}
+
 impl Plugin for PliantBodyPlugin {
     fn build(&self, app: &mut App) {
         #[cfg(feature = "picking")]
         picking::build(app);
-        let fixed = [
-            FixedFirst.intern(),
-            FixedPreUpdate.intern(),
-            FixedUpdate.intern(),
-            FixedPostUpdate.intern(),
-            FixedLast.intern(),
-        ]
-        .contains(&self.schedule);
-
+        let fixed = is_fixed(self.schedule);
         app.init_asset::<ModalAsset>()
             .init_asset_loader::<ModalAssetLoader>()
             .register_type::<ModalBody>()
@@ -196,15 +202,10 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<SingleSteps>()
             .register_type::<Impulse>()
             .register_type::<Push>()
-            .register_type::<Inertia>()
-            .register_type::<Teleport>()
-            .register_type::<RideOn>()
-            .register_type::<SurfaceAnchor>()
             .add_message::<BodyRefused>()
             .add_message::<SingleSteps>()
             .add_message::<Impulse>()
             .add_message::<Push>()
-            .add_message::<Teleport>()
             .init_resource::<PliantTick>()
             .init_resource::<HeldShapesCache>()
             .insert_resource(step::Stepping { fixed })
@@ -235,7 +236,6 @@ impl Plugin for PliantBodyPlugin {
                         step::count_tick,
                         visual::begin_tick,
                         step::place_bodies,
-                        inertia::ride,
                         step::hold_bodies,
                         held::shape_held,
                         impulse::hit_bodies,
@@ -246,15 +246,11 @@ impl Plugin for PliantBodyPlugin {
                     step::publish.in_set(PliantSystems::Publish),
                 ),
             )
-            .add_systems(PreUpdate, (pause::single_steps, inertia::forget_paused))
+            .add_systems(PreUpdate, pause::single_steps)
             .add_systems(
                 PostUpdate,
                 (
                     visual::interpolate.in_set(PliantDisplaySystems::Interpolate),
-                    (ride_on::find_parents, surface_anchor::place_on_surfaces)
-                        .chain()
-                        .after(PliantDisplaySystems::Interpolate)
-                        .before(TransformSystems::Propagate),
                     // This runs after transform propagation, so that no body is stepped with an
                     // outdated transform.
                     step::build_bodies
@@ -262,9 +258,6 @@ impl Plugin for PliantBodyPlugin {
                         .before(PliantDisplaySystems::Deform),
                 ),
             );
-        if fixed {
-            app.add_systems(FixedPreUpdate, inertia::begin_tick).add_systems(FixedLast, inertia::end_tick);
-        }
         #[cfg(feature = "render")]
         deform::build(app);
     }

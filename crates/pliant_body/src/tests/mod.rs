@@ -22,7 +22,7 @@ use std::{sync::Arc, time::Duration};
 use bevy::{ecs::schedule::ScheduleLabel, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
 use pliant_modal::ModalModel;
 
-use crate::{BodyRefused, BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick};
+use crate::{BodyRefused, BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, RidingPlugin};
 
 /// Length of a step, s.
 pub const STEP: f64 = 1.0 / 40.0;
@@ -38,7 +38,7 @@ pub fn app_in(schedule: impl ScheduleLabel) -> App {
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
         .insert_resource(Time::<Fixed>::from_seconds(STEP))
         .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
-        .add_plugins(PliantBodyPlugin::new(schedule))
+        .add_plugins((PliantBodyPlugin::new(schedule.intern()), RidingPlugin::new(schedule)))
         .init_resource::<Told>()
         .add_systems(Last, |mut refused: MessageReader<BodyRefused>, mut told: ResMut<Told>| {
             told.0.extend(refused.read().map(|refused| (refused.entity, refused.error.to_string())));

@@ -12,7 +12,9 @@ use bevy::{
     ecs::message::{MessageRegistry, ShouldUpdateMessages},
     prelude::*,
 };
-use pliant_body::{BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, VisualState};
+use pliant_body::{
+    BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, RidingPlugin, VisualState,
+};
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, Patch, SurfaceMesh};
 use pliant_net::{HostConfig, Invite, JoinConfig, NetHost, NetPlugin, NetStats, RemoteBody, SharedBody};
 
@@ -124,7 +126,7 @@ pub fn app(net: NetPlugin) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
-        .add_plugins((PliantBodyPlugin::default(), net))
+        .add_plugins((PliantBodyPlugin::default(), RidingPlugin::default(), net))
         .add_systems(Last, keep_messages);
     app
 }
