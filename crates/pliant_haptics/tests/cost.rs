@@ -71,18 +71,18 @@ fn ticks(modal: bool, least: &mut [f64], yardstick: &mut f64) -> u64 {
     scene.hand.set_target([0.01, 0.01, 0.0]);
     scene.run(0.2);
     let mut events = Vec::with_capacity(1024);
-    let mut words = Vec::new();
+    let mut locals = Vec::new();
     for _ in 0..64 {
         scene.tick();
-        words.push(scene.model.clone());
+        locals.push(scene.model.clone());
     }
     let before = ALLOCATIONS.with(Cell::get);
     for (k, least) in least.iter_mut().enumerate() {
-        let word = &mut words[k / 8 % 64];
-        word.tick = 1_000_000 + (k / 8) as u64;
-        word.stamp = scene.scheduler.now();
+        let local = &mut locals[k / 8 % 64];
+        local.tick = 1_000_000 + (k / 8) as u64;
+        local.stamp = scene.scheduler.now();
         let begun = cpu_time();
-        scene.cycle.step(&mut scene.scheduler, word, &mut events as &mut Vec<LoopEvent>);
+        scene.cycle.step(&mut scene.scheduler, local, &mut events as &mut Vec<LoopEvent>);
         *least = least.min(cpu_time() - begun);
         if k % 100 == 0 {
             let begun = cpu_time();

@@ -92,16 +92,16 @@ fn spring(key: u64, proxy: [f64; 3], k: f64) -> ToolContact {
 
 /// Runs a hand at rest for `ticks` periods with `contacts`, at 100 local model updates per second.
 /// Returns the force along x at the end and its largest change in a tick, N.
-fn told(core: &mut LoopCore, word: &mut LocalModel, contacts: &[ToolContact], ticks: u64) -> [f64; 2] {
-    word.count = contacts.len();
-    word.contacts[..contacts.len()].copy_from_slice(contacts);
+fn felt_force(core: &mut LoopCore, local: &mut LocalModel, contacts: &[ToolContact], ticks: u64) -> [f64; 2] {
+    local.count = contacts.len();
+    local.contacts[..contacts.len()].copy_from_slice(contacts);
     let mut step = 0.0f64;
     for k in 0..ticks {
         let (last, now) = (*core.last(), core.last().now + 1e-3);
-        word.tick += u64::from(k % 10 == 0);
-        word.period = 0.01;
+        local.tick += u64::from(k % 10 == 0);
+        local.period = 0.01;
         let sample = Sample { sequence: Some((now * 1e3).round() as u64), ..Sample::default() };
-        let wrench = core.tick(now, 1e-3, &sample, word);
+        let wrench = core.tick(now, 1e-3, &sample, local);
         step = step.max((wrench.force[0] - last.wrench.force[0]).abs());
     }
     [core.last().wrench.force[0], step]
@@ -110,29 +110,29 @@ fn told(core: &mut LoopCore, word: &mut LocalModel, contacts: &[ToolContact], ti
 #[test]
 fn a_grab_in_the_place_of_another_comes_by_a_ramp() {
     let new = || LoopCore::new(VirtualConfig::touch().info(), LoopConfig::default()).unwrap();
-    let (mut core, mut word) = (new(), LocalModel::default());
-    let [first, _] = told(&mut core, &mut word, &[spring(1, [0.0, 0.0, 0.0], 200.0)], 600);
+    let (mut core, mut local) = (new(), LocalModel::default());
+    let [first, _] = felt_force(&mut core, &mut local, &[spring(1, [0.0, 0.0, 0.0], 200.0)], 600);
     assert_eq!(first, 0.0);
     // Another grab is 5 mm away, which gives 1 N. The force must rise over the 300 ms of the ramp
     // and not within a tick. The proxy must start at its own position and not at that of the first
     // grab.
-    let [half, step] = told(&mut core, &mut word, &[spring(2, [5e-3, 0.0, 0.0], 200.0)], 150);
+    let [half, step] = felt_force(&mut core, &mut local, &[spring(2, [5e-3, 0.0, 0.0], 200.0)], 150);
     assert!((half - 0.5).abs() < 0.02, "half of it after half of the ramp: {half} N");
     assert!(step < 1.5 / 300.0, "a step of {step} N");
-    let [whole, _] = told(&mut core, &mut word, &[spring(2, [5e-3, 0.0, 0.0], 200.0)], 600);
+    let [whole, _] = felt_force(&mut core, &mut local, &[spring(2, [5e-3, 0.0, 0.0], 200.0)], 600);
     assert!((whole - 1.0).abs() < 0.02, "{whole} N");
     // A second grab beside it has a ramp of its own, and the force of the first grab does not
     // change.
     let both = [spring(3, [5e-3, 0.0, 0.0], 100.0), spring(2, [5e-3, 0.0, 0.0], 200.0)];
-    let [now, step] = told(&mut core, &mut word, &both, 1);
+    let [now, step] = felt_force(&mut core, &mut local, &both, 1);
     assert!((now - whole).abs() < 0.01, "{now} N after {whole} N");
-    let [both, further] = told(&mut core, &mut word, &both, 900);
+    let [both, further] = felt_force(&mut core, &mut local, &both, 900);
     assert!((both - 1.5).abs() < 0.03 && step.max(further) < 1.0 / 300.0, "{both} N, {step} N");
     // A new position of the same grab is not a new grab. The proxy moves there within one update
     // interval.
-    let (mut core, mut word) = (new(), LocalModel::default());
-    told(&mut core, &mut word, &[spring(1, [0.0; 3], 200.0)], 600);
-    let [moved, _] = told(&mut core, &mut word, &[spring(1, [2e-3, 0.0, 0.0], 200.0)], 20);
+    let (mut core, mut local) = (new(), LocalModel::default());
+    felt_force(&mut core, &mut local, &[spring(1, [0.0; 3], 200.0)], 600);
+    let [moved, _] = felt_force(&mut core, &mut local, &[spring(1, [2e-3, 0.0, 0.0], 200.0)], 20);
     assert!((moved - 0.4).abs() < 0.01, "{moved} N");
 }
 

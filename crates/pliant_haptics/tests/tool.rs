@@ -122,33 +122,37 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
     let grab = coupling.grab_config(1.0, 1.0);
     let (k, relaxation) = (grab.stiffness.unwrap(), grab.relaxation);
     let mut writer = ModelWriter::new();
-    let mut word = LocalModel::default();
+    let mut local = LocalModel::default();
     let stiffness = [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]];
     let felt = |x: f64| PublishedGrab { key: 5, point: [x, 0.0, 0.0], stiffness, ..PublishedGrab::default() };
-    writer.write_forces(&[felt(0.0)], relaxation, 0.0, 0.01, 0.0, &mut word);
+    writer.write_forces(&[felt(0.0)], relaxation, 0.0, 0.01, 0.0, &mut local);
     assert!(
-        (word.contacts()[0].damping - coupling.damping).abs() < 1e-12,
+        (local.contacts()[0].damping - coupling.damping).abs() < 1e-12,
         "the damper is the same on both sides"
     );
-    assert_eq!(word.contacts()[0].velocity, [0.0; 3], "a new grab has not moved");
-    writer.write_forces(&[felt(0.001)], relaxation, 0.0, 0.01, 0.01, &mut word);
-    assert!((word.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && word.tick == 2);
-    assert!((word.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
+    assert_eq!(local.contacts()[0].velocity, [0.0; 3], "a new grab has not moved");
+    writer.write_forces(&[felt(0.001)], relaxation, 0.0, 0.01, 0.01, &mut local);
+    assert!((local.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && local.tick == 2);
+    assert!((local.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
     // The body stores 3 mJ. This hand put in 1 mJ of it (1 N over 1 mm into the body), so others
     // have put in 2 mJ.
     let pushed = PublishedGrab { force: [-1.0, 0.0, 0.0], ..felt(0.002) };
-    writer.write_forces(&[pushed], relaxation, 3e-3, 0.01, 0.02, &mut word);
-    assert!((word.stored - 3e-3).abs() < 1e-15 && (word.supplied - 2e-3).abs() < 1e-15, "{}", word.supplied);
-    assert!(word.partial);
+    writer.write_forces(&[pushed], relaxation, 3e-3, 0.01, 0.02, &mut local);
+    assert!(
+        (local.stored - 3e-3).abs() < 1e-15 && (local.supplied - 2e-3).abs() < 1e-15,
+        "{}",
+        local.supplied
+    );
+    assert!(local.partial);
     // The body swings through and back, and nobody puts in energy.
     for stored in [0.0, 3e-3, 1e-3, 3e-3] {
-        writer.write_forces(&[pushed], relaxation, stored, 0.01, 0.02, &mut word);
+        writer.write_forces(&[pushed], relaxation, stored, 0.01, 0.02, &mut local);
     }
-    assert!((word.supplied - 2e-3).abs() < 1e-15, "{}", word.supplied);
-    writer.write_forces(&[pushed], relaxation, f64::NAN, 0.01, 0.02, &mut word);
-    assert!(word.is_finite() && (word.supplied - 2e-3).abs() < 1e-15);
-    writer.write_forces(&[], relaxation, 0.0, 0.01, 0.02, &mut word);
-    assert_eq!(word.contacts().len(), 0);
+    assert!((local.supplied - 2e-3).abs() < 1e-15, "{}", local.supplied);
+    writer.write_forces(&[pushed], relaxation, f64::NAN, 0.01, 0.02, &mut local);
+    assert!(local.is_finite() && (local.supplied - 2e-3).abs() < 1e-15);
+    writer.write_forces(&[], relaxation, 0.0, 0.01, 0.02, &mut local);
+    assert_eq!(local.contacts().len(), 0);
 }
 
 #[test]

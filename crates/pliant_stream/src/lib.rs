@@ -106,5 +106,5 @@ pub use session::{
 };
 pub use state::{
     BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, RigidState, Role,
-    State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo,
+    State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo, next_free,
 };

@@ -242,7 +242,7 @@ impl RigidState {
 
 /// Returns the first free number from `next` on, and sets `next` behind it. Numbers wrap around. If
 /// none is free, it is `next`.
-pub(crate) fn next_free(next: &mut u16, is_free: impl Fn(u16) -> bool) -> u16 {
+pub fn next_free(next: &mut u16, is_free: impl Fn(u16) -> bool) -> u16 {
     let from = *next;
     let found = (0..=u16::MAX).map(|k| from.wrapping_add(k)).find(|&number| is_free(number)).unwrap_or(from);
     *next = found.wrapping_add(1);

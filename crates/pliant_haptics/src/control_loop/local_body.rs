@@ -295,7 +295,7 @@ mod tests {
         let mut model = LocalModel::sized_for(&body);
         ModelWriter::new().write(&body, &[held], &coupling(), 1.0, 0.0, &mut model).unwrap();
         let ticks = (model.period * 1000.0).round() as usize;
-        assert!(ticks > 10, "{} s a word", model.period);
+        assert!(ticks > 10, "{} s a local model", model.period);
         let mut last = x;
         for tick in 0..ticks {
             assert!(copy.advance(tick as f64 * 1e-3, 1, &Tool::new(ToolMap::default()), &model));

@@ -127,7 +127,7 @@ pub struct Inverse {
     late: bool,
 }
 
-/// Ends the connection from another thread, with a command without a force as its last word.
+/// Ends the connection from another thread, with a command without a force as the last thing it sends.
 #[derive(Debug, Default)]
 struct ConnectionSwitch {
     /// The connection's other end and the frame of that command.

@@ -11,7 +11,7 @@ use crate::{DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
 
 /// Natural frequency of the motion to the target, rad/s. The motion is critically damped and within
 /// 1 % after 80 ms.
-const PACE: f64 = 80.0;
+const CATCH_UP: f64 = 80.0;
 /// Maximum speed, m/s. A pointer that leaps then looks like a fast hand and not like a failed
 /// measurement.
 const FASTEST: f64 = 4.0;
@@ -90,10 +90,10 @@ impl Positioned {
     /// form.
     fn go(&mut self, dt: f64) {
         let off = self.position - Vector3::from(self.wanted.position);
-        let lean = self.velocity + off * PACE;
-        let fade = (-PACE * dt).exp();
+        let lean = self.velocity + off * CATCH_UP;
+        let fade = (-CATCH_UP * dt).exp();
         let step = (off + lean * dt) * fade - off;
-        let velocity = (self.velocity - lean * (PACE * dt)) * fade;
+        let velocity = (self.velocity - lean * (CATCH_UP * dt)) * fade;
         let longest = FASTEST * dt;
         let capped = crate::clamp_magnitude(&step, longest);
         self.velocity = if capped == step { crate::clamp_magnitude(&velocity, FASTEST) } else { capped / dt };

@@ -153,11 +153,11 @@ impl Scene {
                 }
             }
             self.body.step().unwrap();
-            let mut word = LocalModel::default();
+            let mut local = LocalModel::default();
             self.writer
-                .write(&self.body, &[self.held], self.cycle.core().coupling(), 1.0, self.seen, &mut word)
+                .write(&self.body, &[self.held], self.cycle.core().coupling(), 1.0, self.seen, &mut local)
                 .unwrap();
-            self.models.push_back((now + self.one_way, word));
+            self.models.push_back((now + self.one_way, local));
         }
         while self.models.front().is_some_and(|(at, _)| *at <= now) {
             self.model = self.models.pop_front().unwrap().1;

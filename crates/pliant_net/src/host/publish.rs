@@ -8,7 +8,9 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::{BodyState, Driven, Grab, GrabForce, Grabs, PliantTick};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, GrabKey, GrabState, RigidState, StepSettings, TickState, UserId, UserLinkInfo};
+use pliant_stream::{
+    BodyId, GrabKey, GrabState, RigidState, StepSettings, TickState, UserId, UserLinkInfo, next_free,
+};
 
 use super::NetHost;
 use super::hands::GuestGrab;
@@ -219,12 +221,9 @@ impl NetHost {
     /// Returns the session's key for a grab made at the host.
     fn own_key(&mut self, entity: Entity) -> GrabKey {
         let grab = self.own_grabs.get(&entity).copied().unwrap_or_else(|| {
-            // The numbers wrap around, and a grab may be held for that long.
+            // A grab may be held until the numbers wrap around.
             let used: BTreeSet<u16> = self.own_grabs.values().copied().collect();
-            let from = self.next_own_grab;
-            let mut all = (0..=u16::MAX).map(|k| from.wrapping_add(k));
-            let grab = all.find(|number| !used.contains(number)).unwrap_or(from);
-            self.next_own_grab = grab.wrapping_add(1);
+            let grab = next_free(&mut self.next_own_grab, |number| !used.contains(&number));
             self.own_grabs.insert(entity, grab);
             grab
         });
