@@ -19,7 +19,7 @@ use crate::surface::Skin;
 use crate::symbolic::{self, Symbolic};
 use crate::{
     Bake, BakeConfig, BakeError, BakeTimes, Stage, canonical, derivatives, flexibility, matrix_market,
-    support,
+    region, support,
 };
 
 /// Largest `|K phi - lambda M phi| / |K phi|` that a bake accepts.
@@ -65,13 +65,14 @@ pub fn bake(
     let mut times = BakeTimes::default();
 
     progress(Stage::Assemble, 0.0);
-    let fe = FeMesh::new(&mesh, config.element);
-    let held = support::anchored_nodes(&fe, &config.anchors)?;
-    let free_body = config.anchors.is_empty();
+    let mut fe = FeMesh::new(&mesh, config.element);
+    region::vary(&mut fe, config)?;
+    let held = support::anchored_nodes(&fe, config)?;
+    let free_body = config.is_free();
     check_mode_count(config.modes, &held, free_body)?;
     let law = law(config);
     let graph = fe.graph(law.average_pressure);
-    support::check_connected(&fe, &graph, &held, &config.anchors)?;
+    support::check_connected(&fe, &graph, &held, config)?;
     let (number, ordered) = elimination_order(&fe, &graph, &held);
     progress(Stage::Assemble, 0.3);
     let matrix = fe.assemble(&law, &number, &ordered);
@@ -135,7 +136,7 @@ pub fn bake(
             poisson: config.poisson,
             density: config.density,
             damping: config.damping,
-            anchors: config.anchors.iter().map(ToString::to_string).collect(),
+            anchors: support::names(config),
             residual_max,
             orthonormality_max,
         },
@@ -194,7 +195,9 @@ fn simulation_mesh(
         .collect();
     let (scales, displacements) = SimulationMesh::quantized(&values, count);
     let vertices = skin.places.clone();
-    Some(SimulationMesh { corners, tets: mesh.tets.clone(), scales, displacements, vertices })
+    let varied = fe.stiffness.iter().any(|&factor| factor != 1.0);
+    let stiffness = if varied { fe.stiffness.iter().map(|&x| x as f32).collect() } else { Vec::new() };
+    Some(SimulationMesh { corners, tets: mesh.tets.clone(), scales, displacements, vertices, stiffness })
 }
 
 fn no_modes(failure: Failure) -> BakeError {

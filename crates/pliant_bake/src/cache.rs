@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use pliant_mesh::{Surface, TetMesh, io::write_whole};
 use pliant_modal::{Damping, FORMAT_VERSION, ModalModel};
 
-use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
+use crate::{Bake, BakeConfig, BakeError, BakeTimes, Paint, Stage, bake};
 
 /// Version of the bake method, which is part of every key.
 ///
@@ -47,6 +47,8 @@ impl BakeKey {
             density,
             damping,
             anchors,
+            regions,
+            paint,
             sites,
             site_radii,
             export_matrices: _,
@@ -63,6 +65,16 @@ impl BakeKey {
         }
         hash.count(anchors.len());
         anchors.iter().for_each(|anchor| hash.text(&anchor.to_string()));
+        hash.count(regions.len());
+        regions.iter().for_each(|region| hash.text(&region.to_string()));
+        hash.count(usize::from(paint.is_some()));
+        if let Some(Paint { surface, stiffness, density, anchored }) = paint {
+            hash.surface(surface);
+            for values in [stiffness, density, anchored] {
+                hash.count(values.len());
+                hash.numbers(values);
+            }
+        }
         hash.count(sites.map_or(0, |sites| sites.saturating_add(1)));
         hash.count(site_radii.len());
         hash.numbers(site_radii);
@@ -72,14 +84,8 @@ impl BakeKey {
         hash.count(tets.len());
         hash.words(tets.as_flattened());
         hash.count(usize::from(skin.is_some()));
-        if let Some(Surface { positions, triangles, uvs }) = skin {
-            hash.count(positions.len());
-            hash.numbers(positions.as_flattened());
-            hash.count(triangles.len());
-            hash.words(triangles.as_flattened());
-            hash.count(uvs.as_ref().map_or(0, |uvs| uvs.len() + 1));
-            let bits = uvs.iter().flatten().flatten().map(|x| x.to_bits());
-            hash.words(&bits.collect::<Vec<u32>>());
+        if let Some(skin) = skin {
+            hash.surface(skin);
         }
         Self(*hash.0.finalize().as_bytes())
     }
@@ -111,6 +117,17 @@ impl Hasher {
     fn numbers(&mut self, numbers: &[f64]) {
         let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_bits().to_le_bytes()).collect();
         self.0.update(&bytes);
+    }
+
+    fn surface(&mut self, surface: &Surface) {
+        let Surface { positions, triangles, uvs } = surface;
+        self.count(positions.len());
+        self.numbers(positions.as_flattened());
+        self.count(triangles.len());
+        self.words(triangles.as_flattened());
+        self.count(uvs.as_ref().map_or(0, |uvs| uvs.len() + 1));
+        let bits = uvs.iter().flatten().flatten().map(|x| x.to_bits());
+        self.words(&bits.collect::<Vec<u32>>());
     }
 
     fn words(&mut self, words: &[u32]) {
@@ -348,7 +365,8 @@ mod tests {
     fn every_part_of_the_input_is_in_the_key() {
         let (mesh, plain) = (bar(), config());
         let mut keys = vec![BakeKey::new(&mesh, None, &plain)];
-        let changes: [&dyn Fn(&mut BakeConfig); 11] = [
+        let painted = || Paint::new(bar().boundary().0);
+        let changes: [&dyn Fn(&mut BakeConfig); 15] = [
             &|c| c.name = "x".into(),
             &|c| c.element = Element::Tet10,
             &|c| c.modes = 5,
@@ -358,6 +376,10 @@ mod tests {
             &|c| c.damping = Damping::Ratio(0.5),
             &|c| c.damping = Damping::Rayleigh { alpha: 0.5, beta: 0.0 },
             &|c| c.anchors.clear(),
+            &|c| c.regions = vec!["x>0.1: stiffness 2".parse().unwrap()],
+            &|c| c.regions = vec!["x>0.1: density 2".parse().unwrap()],
+            &|c| c.paint = Some(painted()),
+            &|c| c.paint = Some(Paint { density: vec![1.0], ..painted() }),
             &|c| c.sites = None,
             &|c| c.site_radii = vec![0.03, 0.06],
         ];

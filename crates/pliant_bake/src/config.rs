@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use pliant_modal::{Damping, Element, Material, ModalModel};
 
-use crate::{Anchor, BakeError};
+use crate::{Anchor, BakeError, Paint, Region, region};
 
 const _: () = assert!(
     ModalModel::MAX_MODES == 4096 && ModalModel::MAX_TEXT == 256 && ModalModel::MAX_ANCHORS == 64,
@@ -44,6 +44,11 @@ pub struct BakeConfig {
     /// Anchors, at most [`ModalModel::MAX_ANCHORS`]. A node is fixed when any anchor contains it.
     /// Default: none, a free body.
     pub anchors: Vec<Anchor>,
+    /// Parts of the body that are stiffer, softer, heavier or lighter than the rest, at most 64.
+    /// Default: none.
+    pub regions: Vec<Region>,
+    /// Stiffness, density and anchors that are painted on a surface. Default: none.
+    pub paint: Option<Paint>,
     /// Number of surface sites for which the residual flexibility is baked, at most one per vertex.
     ///
     /// The sites are spread evenly. Default: `None`, one site at every vertex. For very large
@@ -72,6 +77,8 @@ impl Default for BakeConfig {
             density: 1000.0,
             damping: Damping::Ratio(0.03),
             anchors: Vec::new(),
+            regions: Vec::new(),
+            paint: None,
             sites: None,
             site_radii: vec![0.02, 0.028, 0.04, 0.056, 0.08, 0.113, 0.16],
             export_matrices: None,
@@ -86,6 +93,11 @@ impl BakeConfig {
 
     /// Maximum number of coordinates of a model with a [`material`](Self::material).
     pub const MAX_COORDINATES: usize = 120;
+
+    /// Returns whether nothing fixes the body: neither an anchor nor a painting.
+    pub fn is_free(&self) -> bool {
+        self.anchors.is_empty() && !self.paint.as_ref().is_some_and(Paint::anchors)
+    }
 
     /// Checks the numbers that do not depend on the mesh.
     ///
@@ -140,6 +152,7 @@ impl BakeConfig {
         let (name, anchors) = (self.name.len(), self.anchors.len());
         number("name", "at most 256 bytes", name <= ModalModel::MAX_TEXT, name as f64)?;
         number("anchors", "at most 64", anchors <= ModalModel::MAX_ANCHORS, anchors as f64)?;
+        region::check(self)?;
         if self.modes == 0 || self.modes > ModalModel::MAX_MODES {
             return Err(BakeError::Parameter {
                 name: "modes",

@@ -10,7 +10,8 @@ use crate::fem::{ANCHORED, FeMesh};
 /// Tangent of an element as 3x3 blocks: block (i, j) is at `(i * MAX_NODES + j) * 9`.
 pub(crate) type Blocks = [f64; MAX_NODES * MAX_NODES * 9];
 
-/// Elements with a material. Displacements and forces have one entry per free degree of freedom.
+/// Elements with a material. Weights of quadrature points contain the factor of the element's
+/// moduli, in which all energies are linear. Displacements and forces have one entry per free degree of freedom.
 #[derive(Clone, Copy)]
 pub(crate) struct Continuum<'a> {
     pub(crate) fe: &'a FeMesh,
@@ -52,7 +53,7 @@ impl Continuum<'_> {
                     *h += u * g.transpose();
                 }
             }
-            visit(share * affine.volume, &g[..nodes.len()], gradients);
+            visit(share * self.fe.elastic_volume(index), &g[..nodes.len()], gradients);
         }
     }
 
@@ -83,7 +84,7 @@ impl Continuum<'_> {
         for &point in points {
             let g = affine.shape_gradients(self.fe.element, point).map(Vector3::from);
             let h = at.iter().zip(&g[..per]).fold(Matrix3::zeros(), |sum, (u, g)| sum + u * g.transpose());
-            visit(share * affine.volume, &g[..per], &h);
+            visit(share * self.fe.elastic_volume(index), &g[..per], &h);
         }
     }
 

@@ -104,7 +104,8 @@ fn points(training: &Training<'_>, most: usize) -> Vec<Point> {
     let per = pliant_modal::tetrahedron::stiffness_points(continuum.fe.element).0.len();
     let stride = (elements * per).div_ceil(most).max(1);
     // Elements in the order of a coarse grid lie beside each other, so that each stretch of the
-    // list is a place of the body.
+    // list is a place of the body. Only elements of about the same moduli stand for each other,
+    // because a stiff part strains less than the soft one beside it.
     let mut order: Vec<usize> = (0..elements).collect();
     let center = |index: usize| -> Vector3<f64> {
         let nodes = &continuum.nodes(index)[..4];
@@ -114,7 +115,7 @@ fn points(training: &Training<'_>, most: usize) -> Vec<Point> {
     let key = |index: usize| {
         let at = center(index);
         let place: [i64; 3] = std::array::from_fn(|k| (at[k] / cell).floor() as i64);
-        (place, index)
+        (continuum.fe.stiffness[index].log2().round() as i64, place, index)
     };
     order.sort_by_cached_key(|&index| key(index));
     let groups: Vec<&[usize]> = order.chunks(stride).collect();
@@ -123,9 +124,9 @@ fn points(training: &Training<'_>, most: usize) -> Vec<Point> {
         .enumerate()
         .flat_map_iter(|(group, members)| {
             // All points of one element of each group, for the volume of the group.
-            let volume: f64 = members.iter().map(|&e| continuum.fe.affine[e].volume).sum();
+            let volume: f64 = members.iter().map(|&e| continuum.fe.elastic_volume(e)).sum();
             let index = members[(group * 7919) % members.len()];
-            let share = volume / continuum.fe.affine[index].volume;
+            let share = volume / continuum.fe.elastic_volume(index);
             let mut found = Vec::with_capacity(per);
             let mut gradients = vec![Matrix3::zeros(); m];
             let phi = &training.coordinates.phi;

@@ -39,6 +39,9 @@ pub enum BakeError {
     /// The skin is not a valid surface.
     #[error("the skin: {0}")]
     Skin(#[source] MeshError),
+    /// The painted surface is not a valid surface.
+    #[error("the painted surface: {0}")]
+    Paint(#[source] MeshError),
     /// A vertex of the skin lies too far from the tetrahedra to move with them.
     #[error(
         "skin vertex {vertex} at {at:?} is {distance} m away from the tetrahedra: expected at most {allowed} m"

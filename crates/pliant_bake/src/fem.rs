@@ -29,13 +29,18 @@ pub(crate) struct FeMesh {
     pub(crate) connectivity: Vec<u32>,
     /// Volume and barycentric gradients of each element.
     pub(crate) affine: Vec<Affine>,
+    /// Factor of the moduli of each element.
+    pub(crate) stiffness: Vec<f64>,
+    /// Factor of the density of each element.
+    pub(crate) density: Vec<f64>,
 }
 
 impl FeMesh {
     /// Makes the elements of a mesh that has passed `TetMesh::check`.
     pub(crate) fn new(mesh: &TetMesh, element: Element) -> Self {
         let corner = |i: u32| mesh.nodes[i as usize];
-        let affine = mesh.tets.par_iter().map(|t| Affine::new(t.map(corner))).collect();
+        let affine: Vec<Affine> = mesh.tets.par_iter().map(|t| Affine::new(t.map(corner))).collect();
+        let (stiffness, density) = (vec![1.0; affine.len()], vec![1.0; affine.len()]);
         let mut nodes = mesh.nodes.clone();
         let corners = nodes.len();
         let (connectivity, edges) = tetrahedron::connectivity(corners, &mesh.tets, element);
@@ -43,7 +48,7 @@ impl FeMesh {
             let (a, b) = (corner(a), corner(b));
             [0, 1, 2].map(|k| 0.5 * (a[k] + b[k]))
         }));
-        Self { element, nodes, corners, connectivity, affine }
+        Self { element, nodes, corners, connectivity, affine, stiffness, density }
     }
 
     /// Iterates over the node numbers of each element.
@@ -99,13 +104,13 @@ impl FeMesh {
         let lambda = if law.average_pressure { 0.0 } else { law.lambda };
         let mut batch = vec![[0.0; MAX_NODES * MAX_NODES * 9]; BATCH.min(self.affine.len())];
         for (index, affine) in self.affine.chunks(BATCH).enumerate() {
-            batch[..affine.len()]
-                .par_iter_mut()
-                .zip(affine)
-                .for_each(|(k, affine)| element::stiffness(self.element, affine, lambda, law.mu, k));
-            for (local, (k, affine)) in batch.iter().zip(affine).enumerate() {
+            let factors = &self.stiffness[index * BATCH..][..affine.len()];
+            batch[..affine.len()].par_iter_mut().zip(affine).zip(factors).for_each(|((k, affine), s)| {
+                element::stiffness(self.element, affine, s * lambda, s * law.mu, k);
+            });
+            for (local, k) in batch[..affine.len()].iter().enumerate() {
                 let nodes = &self.connectivity[(index * BATCH + local) * per..][..per];
-                let mass = law.density * affine.volume;
+                let mass = law.density * self.filled_volume(index * BATCH + local);
                 for (i, &a) in nodes.iter().enumerate() {
                     let row = number[a as usize];
                     if row == ANCHORED {
@@ -133,8 +138,9 @@ impl FeMesh {
 
     /// Adds the volumetric stiffness with nodal-averaged pressure, `sum_a lambda / V_a d_a d_a^T`.
     ///
-    /// Here `d_a . u = int N_a div u dV` and `V_a = int N_a dV` over the elements around corner
-    /// `a`. The method is due to Bonet and Burton (1998) for linear tetrahedra. For quadratic
+    /// Here `d_a . u = int N_a div u dV` and `V_a = int N_a / s dV` over the elements around corner
+    /// `a`, with the factor `s` of their moduli: the pressure is continuous, so compliances add up.
+    /// The method is due to Bonet and Burton (1998) for linear tetrahedra. For quadratic
     /// tetrahedra it is the Taylor-Hood pair with a lumped pressure mass. Neither element therefore
     /// locks as the Poisson ratio approaches 1/2.
     fn add_averaged_pressure(&self, lambda: f64, number: &[u32], out: &mut BlockCsr) {
@@ -150,7 +156,7 @@ impl FeMesh {
             for &e in around.of(corner) {
                 let nodes = &self.connectivity[e as usize * per..][..per];
                 let local = nodes[..4].iter().position(|&n| n as usize == corner).unwrap_or(0);
-                volume += self.affine[e as usize].volume / 4.0;
+                volume += self.affine[e as usize].volume / (4.0 * self.stiffness[e as usize]);
                 for (&node, gradient) in nodes.iter().zip(&gradients[e as usize][local]) {
                     let at = &mut slot[node as usize];
                     if *at == usize::MAX {
@@ -185,13 +191,24 @@ impl FeMesh {
     pub(crate) fn nodal_mass(&self, density: f64) -> Vec<f64> {
         let unit_mass = element::unit_mass(self.element);
         let mut out = vec![0.0; self.nodes.len()];
-        for (nodes, affine) in self.elements().zip(&self.affine) {
+        for (index, nodes) in self.elements().enumerate() {
+            let mass = density * self.filled_volume(index);
             for (i, &node) in nodes.iter().enumerate() {
                 let row: f64 = unit_mass[i * MAX_NODES..][..nodes.len()].iter().sum();
-                out[node as usize] += density * affine.volume * row;
+                out[node as usize] += mass * row;
             }
         }
         out
+    }
+
+    /// Returns the volume of an element times the factor of its density, m^3.
+    pub(crate) fn filled_volume(&self, index: usize) -> f64 {
+        self.affine[index].volume * self.density[index]
+    }
+
+    /// Returns the volume of an element times the factor of its moduli, m^3.
+    pub(crate) fn elastic_volume(&self, index: usize) -> f64 {
+        self.affine[index].volume * self.stiffness[index]
     }
 
     /// Returns the volume of the mesh, m^3.

@@ -330,7 +330,7 @@ mod tests {
         let config = BakeConfig { anchors: vec!["x<0.001".parse().unwrap()], ..Default::default() };
         let fe = FeMesh::new(&mesh, Element::Tet10);
         let graph = fe.graph(false);
-        let held = support::anchored_nodes(&fe, &config.anchors).unwrap();
+        let held = support::anchored_nodes(&fe, &config).unwrap();
         let (number, ordered) = elimination_order(&fe, &graph, &held);
         let matrix = fe.assemble(&law(&config), &number, &ordered);
         let solver = Solver::new(&matrix, Symbolic::new(&ordered), None).unwrap();

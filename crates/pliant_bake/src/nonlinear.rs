@@ -28,7 +28,7 @@ use crate::fem::{ANCHORED, FeMesh};
 use crate::sparse::BlockCsr;
 use crate::surface::Skin;
 use crate::symbolic::Symbolic;
-use crate::{BakeConfig, BakeError, support};
+use crate::{BakeConfig, BakeError, region, support};
 
 /// Number of Newton iterations in one increment before the increment is halved.
 const ROUNDS: usize = 100;
@@ -116,7 +116,7 @@ pub fn deflect(
     if config.poisson > 0.45 {
         return refuse("Poisson ratio", "at most 0.45 for a nonlinear solution", config.poisson);
     }
-    if config.anchors.is_empty() {
+    if config.is_free() {
         return refuse("anchors", "at least one for a nonlinear solution", 0.0);
     }
     if loads.prescribed.len() > 64 {
@@ -130,10 +130,11 @@ pub fn deflect(
     mesh.check().map_err(BakeError::Mesh)?;
     let mut mesh = mesh.clone();
     mesh.drop_unused_nodes();
-    let fe = FeMesh::new(&mesh, config.element);
-    let held = support::anchored_nodes(&fe, &config.anchors)?;
+    let mut fe = FeMesh::new(&mesh, config.element);
+    region::vary(&mut fe, config)?;
+    let held = support::anchored_nodes(&fe, config)?;
     let graph = fe.graph(false);
-    support::check_connected(&fe, &graph, &held, &config.anchors)?;
+    support::check_connected(&fe, &graph, &held, config)?;
     let (number, ordered) = elimination_order(&fe, &graph, &held);
     let skin = Skin::new(&mesh, &fe, None, &number)?;
     let dofs = 3 * number.iter().filter(|&&row| row != ANCHORED).count();
@@ -227,10 +228,10 @@ fn mean(places: &[(u32, f64)], values: &[f64]) -> [f64; 3] {
     })
 }
 
-/// Returns the nodal forces of a force per volume, N/m^3.
+/// Returns the nodal forces of a force per volume of the body's base density, N/m^3.
 fn weight(fe: &FeMesh, number: &[u32], dofs: usize, per_volume: [f64; 3]) -> Vec<f64> {
     let mut out = vec![0.0; dofs];
-    for (nodes, affine) in fe.elements().zip(&fe.affine) {
+    for (index, nodes) in fe.elements().enumerate() {
         for (i, &node) in nodes.iter().enumerate() {
             // Integrals of the shape functions over the element, as shares of its volume.
             let share = match fe.element {
@@ -240,7 +241,9 @@ fn weight(fe: &FeMesh, number: &[u32], dofs: usize, per_volume: [f64; 3]) -> Vec
             };
             let row = number[node as usize];
             if row != ANCHORED {
-                (0..3).for_each(|k| out[3 * row as usize + k] += share * affine.volume * per_volume[k]);
+                (0..3).for_each(|k| {
+                    out[3 * row as usize + k] += share * fe.filled_volume(index) * per_volume[k]
+                });
             }
         }
     }

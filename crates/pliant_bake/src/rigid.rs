@@ -22,17 +22,17 @@ impl MassProperties {
     /// The second moments of a tetrahedron of volume V are `int x_k x_l = V/20 (sum_a x_ak x_al +
     /// sum_a x_ak sum_b x_bl)`.
     pub(crate) fn new(mesh: &FeMesh, density: f64) -> Self {
-        let volume = mesh.volume();
+        let volume: f64 = (0..mesh.affine.len()).map(|index| mesh.filled_volume(index)).sum();
         let mut first = [0.0; 3];
-        for (nodes, affine) in mesh.elements().zip(&mesh.affine) {
+        for (index, nodes) in mesh.elements().enumerate() {
             for (k, first) in first.iter_mut().enumerate() {
                 let sum: f64 = nodes[..4].iter().map(|&n| mesh.nodes[n as usize][k]).sum();
-                *first += affine.volume * sum / 4.0;
+                *first += mesh.filled_volume(index) * sum / 4.0;
             }
         }
         let center = first.map(|x| x / volume);
         let mut second = Matrix3::zeros();
-        for (nodes, affine) in mesh.elements().zip(&mesh.affine) {
+        for (index, nodes) in mesh.elements().enumerate() {
             let corners =
                 [0, 1, 2, 3].map(|a| Vector3::from(mesh.nodes[nodes[a] as usize]) - Vector3::from(center));
             let sum: Vector3<f64> = corners.iter().sum();
@@ -40,7 +40,7 @@ impl MassProperties {
             for corner in corners {
                 moment += corner * corner.transpose();
             }
-            second += moment * (affine.volume / 20.0);
+            second += moment * (mesh.filled_volume(index) / 20.0);
         }
         let inertia = (Matrix3::identity() * second.trace() - second) * density;
         Self {

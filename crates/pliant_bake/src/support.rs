@@ -3,16 +3,23 @@
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
 use crate::fem::{FeMesh, Lists};
-use crate::{Anchor, BakeError};
+use crate::{BakeConfig, BakeError, Paint, region};
+
+/// Stands among the texts of a model's anchors for a painting.
+const PAINTED: &str = "painted";
 
 /// Distance from a line, as a fraction of the body's size, below which anchored nodes count as
 /// lying on the line.
 const THIN: f64 = 1e-6;
 
-/// Returns for each node whether it is anchored. All entries are false without anchors.
-pub(crate) fn anchored_nodes(fe: &FeMesh, anchors: &[Anchor]) -> Result<Vec<bool>, BakeError> {
-    let mut held = vec![false; fe.nodes.len()];
-    for anchor in anchors {
+/// Returns for each node whether an anchor or the painting fixes it. All entries are false for a
+/// free body.
+pub(crate) fn anchored_nodes(fe: &FeMesh, config: &BakeConfig) -> Result<Vec<bool>, BakeError> {
+    let mut held = match &config.paint {
+        Some(paint) => region::painted_nodes(fe, paint)?,
+        None => vec![false; fe.nodes.len()],
+    };
+    for anchor in &config.anchors {
         let mut any = false;
         for (held, &p) in held.iter_mut().zip(&fe.nodes) {
             if anchor.holds(p) {
@@ -30,7 +37,7 @@ pub(crate) fn anchored_nodes(fe: &FeMesh, anchors: &[Anchor]) -> Result<Vec<bool
         }
     }
     if held.iter().all(|&held| held) {
-        return Err(BakeError::AnchorHoldsEverything { anchors: names(anchors), nodes: held.len() });
+        return Err(BakeError::AnchorHoldsEverything { anchors: quoted(config), nodes: held.len() });
     }
     Ok(held)
 }
@@ -41,10 +48,10 @@ pub(crate) fn check_connected(
     fe: &FeMesh,
     graph: &Lists,
     held: &[bool],
-    anchors: &[Anchor],
+    config: &BakeConfig,
 ) -> Result<(), BakeError> {
     let parts = connected_parts(graph);
-    if anchors.is_empty() {
+    if config.is_free() {
         return match parts.get(1) {
             None => Ok(()),
             Some(part) => Err(loose(fe, part, parts.len())),
@@ -74,7 +81,7 @@ pub(crate) fn check_connected(
         moments.sort_by(f64::total_cmp);
         if moments[1] <= (THIN * size).powi(2) {
             return Err(BakeError::AnchorTooThin {
-                anchors: names(anchors),
+                anchors: quoted(config),
                 nodes: nodes.len(),
                 at: mean.into(),
             });
@@ -83,8 +90,14 @@ pub(crate) fn check_connected(
     Ok(())
 }
 
-fn names(anchors: &[Anchor]) -> String {
-    anchors.iter().map(|a| format!("`{a}`")).collect::<Vec<_>>().join(", ")
+fn quoted(config: &BakeConfig) -> String {
+    names(config).iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ")
+}
+
+/// Returns the texts of the anchors, and [`PAINTED`] if the painting fixes something.
+pub(crate) fn names(config: &BakeConfig) -> Vec<String> {
+    let painted = config.paint.as_ref().is_some_and(Paint::anchors).then(|| PAINTED.to_owned());
+    config.anchors.iter().map(ToString::to_string).chain(painted).collect()
 }
 
 fn loose(fe: &FeMesh, part: &[u32], parts: usize) -> BakeError {

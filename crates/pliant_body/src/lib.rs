@@ -54,6 +54,7 @@ mod grab;
 mod held;
 mod impulse;
 mod inertia;
+mod mesh_triangles;
 mod pause;
 mod pick;
 #[cfg(feature = "picking")]
@@ -78,7 +79,8 @@ use bevy::{
 pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 #[cfg(feature = "bake")]
 pub use bake::{
-    BakeBodyError, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
+    ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeBodyError, BakeFailed, BakePlugin,
+    BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
 };
 pub use body::{BodyState, Driven, ModalBody, NoPointerGrab};
 #[cfg(feature = "render")]
@@ -88,6 +90,7 @@ pub use grab::{Grab, GrabForce, GrabOf, Grabs};
 pub use held::HeldShapesCache;
 pub use impulse::{Impulse, Push};
 pub use inertia::{Inertia, Teleport};
+pub use mesh_triangles::MeshTriangles;
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
 pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSettings};

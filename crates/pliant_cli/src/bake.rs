@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::Args;
-use pliant_bake::{Anchor, BakeCache, BakeConfig, Stage, bake_cached};
+use pliant_bake::{Anchor, BakeCache, BakeConfig, Region, Stage, bake_cached};
 use pliant_lab::{Progress, fill::fill};
 use pliant_mesh::{Repair, io};
 use pliant_modal::{Damping, Element, Material, ModalModel};
@@ -52,6 +52,10 @@ pub(crate) struct BakeArgs {
     /// free
     #[arg(long = "anchor", value_name = "AXIS<NUMBER", allow_hyphen_values = true)]
     anchors: Vec<Anchor>,
+    /// Makes a part of the body stiffer or heavier, such as 'x>0.2 & y<0.1: stiffness 50, density
+    /// 1.5' (factors). Repeatable
+    #[arg(long = "region", value_name = "HALF-SPACES: FACTORS", allow_hyphen_values = true)]
+    regions: Vec<Region>,
     /// A surface to use instead of the tetrahedra's boundary. The surface moves with the tetrahedra
     #[arg(long, value_name = "SURFACE")]
     skin: Option<PathBuf>,
@@ -177,6 +181,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         density: args.density,
         damping,
         anchors: args.anchors,
+        regions: args.regions,
         export_matrices: args.export_matrices,
         ..defaults
     };

@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use bevy::{
     math::DVec3,
-    mesh::{Indices, PrimitiveTopology, VertexAttributeValues},
     prelude::*,
     tasks::{AsyncComputeTaskPool, Task, block_on, poll_once},
 };
@@ -16,6 +15,7 @@ use parry3d_f64::{
     shape::{TriMesh, TriMeshFlags},
     transformation::{ConvexHullError, try_convex_hull},
 };
+use pliant_body::MeshTriangles;
 use pliant_modal as modal;
 use pliant_modal::StepError;
 
@@ -184,20 +184,9 @@ struct Source {
 
 impl Source {
     fn new(mesh: &Mesh, hull: bool) -> Result<Self, StepError> {
-        let missing = |what, expected| Err(StepError::Input { what, expected, got: f64::NAN });
-        let positions = match mesh.try_attribute(Mesh::ATTRIBUTE_POSITION) {
-            Ok(VertexAttributeValues::Float32x3(positions)) => positions.clone(),
-            _ => return missing("positions of an obstacle's mesh", "three f32, kept in the main world"),
-        };
-        if mesh.primitive_topology() != PrimitiveTopology::TriangleList {
-            return missing("topology of an obstacle's mesh", "a list of triangles");
-        }
-        let indices: Vec<u32> = match mesh.try_indices() {
-            Ok(Indices::U16(indices)) => indices.iter().map(|&i| u32::from(i)).collect(),
-            Ok(Indices::U32(indices)) => indices.clone(),
-            Err(_) => (0..positions.len() as u32).collect(),
-        };
-        Ok(Self { positions, triangles: indices.as_chunks::<3>().0.to_vec(), hull })
+        let unusable = |expected| StepError::Input { what: "an obstacle's mesh", expected, got: f64::NAN };
+        let MeshTriangles { positions, triangles } = MeshTriangles::of(mesh).map_err(unusable)?;
+        Ok(Self { positions, triangles, hull })
     }
 }
 

@@ -26,6 +26,7 @@
 mod bvh;
 mod error;
 pub mod io;
+mod locator;
 mod repair;
 pub mod sdf;
 pub mod shapes;
@@ -35,6 +36,7 @@ mod surface;
 mod tets;
 
 pub use error::{MeshError, Place};
+pub use locator::{ClosestPoint, SurfaceLocator};
 pub use repair::Repair;
 pub use stuffing::{Parts, StuffOptions, stuff};
 pub use surface::Surface;

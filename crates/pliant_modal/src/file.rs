@@ -17,8 +17,9 @@
 //! u32, corners f32 x 3 c, tetrahedra u32 x 4 t, scales f32 x m, displacements i16 x 3 k m, and a
 //! place u32 x 1, f32 x 6 for each surface vertex. It follows section `NLIN`, which is the reduced
 //! elasticity of `p` points: material u8 (0 neo-Hookean, 1 St. Venant-Kirchhoff), `p` u32, weights
-//! f64 x p, gradients f32 x 9 p m. A model without it has linear elasticity only. All numbers are
-//! little-endian. A reader checks magic, version, length and hash before it decodes the payload.
+//! f64 x p, gradients f32 x 9 p m. A model without it has linear elasticity only. Section `STIF`,
+//! f32 x t, follows `MESH` where the moduli differ: their factor in each tetrahedron. All numbers
+//! are little-endian. A reader checks magic, version, length and hash before it decodes the payload.
 
 use std::{
     fs, io,
@@ -45,6 +46,9 @@ const REDUCED: [u8; 4] = *b"NLIN";
 
 /// Tag of the section with the simulation mesh.
 const MESH: [u8; 4] = *b"MESH";
+
+/// Tag of the section with the stiffness of the tetrahedra.
+const STIFFNESS: [u8; 4] = *b"STIF";
 
 const HEADER: usize = 8 + 4 + 8 + 32;
 
@@ -112,6 +116,9 @@ pub(crate) fn encode(parts: &ModelParts) -> Vec<u8> {
         add(REDUCED, section);
         if let Some(mesh) = &reduced.mesh {
             add(MESH, encode_mesh(mesh));
+            if !mesh.stiffness.is_empty() {
+                add(STIFFNESS, mesh.stiffness.iter().flat_map(|x| x.to_le_bytes()).collect());
+            }
         }
     }
 
@@ -390,7 +397,15 @@ fn reduced(rest: &mut &[u8], modes: usize, vertices: usize) -> Result<ReducedEla
     let count = points.saturating_mul(9).saturating_mul(modes);
     let gradients = words::<4>("cubature gradients", &mut bytes, count)?.map(f32::from_le_bytes).collect();
     used_up(bytes)?;
-    let mesh = if rest.is_empty() { None } else { Some(mesh(section(rest, MESH)?, modes, vertices)?) };
+    let mut mesh = if rest.is_empty() { None } else { Some(mesh(section(rest, MESH)?, modes, vertices)?) };
+    if let Some(mesh) = &mut mesh
+        && !rest.is_empty()
+    {
+        let mut bytes = section(rest, STIFFNESS)?;
+        let stiffness = words::<4>("tetrahedra's stiffness", &mut bytes, mesh.tets.len())?;
+        mesh.stiffness = stiffness.map(f32::from_le_bytes).collect();
+        used_up(bytes)?;
+    }
     Ok(ReducedElasticity { material, weights, gradients, mesh })
 }
 
@@ -416,5 +431,5 @@ fn mesh(mut bytes: &[u8], modes: usize, vertices: usize) -> Result<SimulationMes
     };
     let vertices = words::<28>("vertex places", &mut bytes, vertices)?.map(place).collect();
     used_up(bytes)?;
-    Ok(SimulationMesh { corners, tets, scales, displacements, vertices })
+    Ok(SimulationMesh { corners, tets, scales, displacements, vertices, stiffness: Vec::new() })
 }

@@ -197,6 +197,16 @@ fn made_of(scene: &SceneDescription, body: &BodyEntry, at: &dyn Fn(&'static str)
             if bake.anchors.len() > 100 {
                 return Err(fault(&inner("anchors"), SceneErrorKind::Value, "expected at most 100 anchors"));
             }
+            if bake.regions.len() > 64 {
+                return Err(fault(&inner("regions"), SceneErrorKind::Value, "expected at most 64 regions"));
+            }
+            #[cfg(feature = "bake")]
+            for (i, region) in bake.regions.iter().enumerate() {
+                if let Err(error) = region.parse::<crate::bake::Region>() {
+                    let path = [inner("regions"), vec![Item(i)]].concat();
+                    return Err(fault(&path, SceneErrorKind::Value, error.to_string()));
+                }
+            }
             #[cfg(feature = "bake")]
             for (i, anchor) in bake.anchors.iter().enumerate() {
                 if let Err(error) = anchor.parse::<crate::bake::Anchor>() {

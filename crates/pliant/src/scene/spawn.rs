@@ -380,7 +380,7 @@ fn spawn_body(
     }
     #[cfg(feature = "bake")]
     if let Some(bake) = body.bake.as_ref().filter(|_| !guest) {
-        use crate::bake::{Anchor, BakeConfig};
+        use crate::bake::{Anchor, BakeConfig, Region};
         use crate::body::{BakeRequest, BakeShape};
         use crate::modal::Damping;
         let root = world.get_resource::<AssetRoot>().map(|root| root.0.clone()).unwrap_or_default();
@@ -391,8 +391,9 @@ fn spawn_body(
             poisson: bake.poisson,
             density: bake.density,
             damping: Damping::Ratio(bake.damping_ratio),
-            // The check of the scene has parsed these anchors before.
+            // The check of the scene has parsed these texts before.
             anchors: bake.anchors.iter().filter_map(|anchor| anchor.parse::<Anchor>().ok()).collect(),
+            regions: bake.regions.iter().filter_map(|region| region.parse::<Region>().ok()).collect(),
             ..default()
         };
         let shape = BakeShape::File(root.join(&bake.shape));

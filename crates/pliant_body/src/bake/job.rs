@@ -148,6 +148,10 @@ fn mesh(
         BakeShape::Distance(distance) => {
             ((stuff(&**distance, &options, &mut progress)?, None), Own("a distance", None))
         }
+        // A request begins when its mesh has become a surface.
+        BakeShape::Mesh(_) => {
+            return Err(BakeBodyError::UnusableMesh { expected: "a mesh that is loaded" });
+        }
         BakeShape::Input(input) => fill(Input::clone(input), &options, &mut progress)?,
         BakeShape::File(path) => fill(read(path)?, &options, &mut progress)?,
     };

@@ -1,5 +1,6 @@
 //! Baking inside the running game.
 
+mod from_mesh;
 mod job;
 mod request;
 
@@ -8,9 +9,11 @@ use std::collections::VecDeque;
 use bevy::prelude::*;
 use pliant_bake::BakeCache;
 
+pub use from_mesh::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS};
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 
 use crate::{ModalAsset, ModalBody};
+use from_mesh::{Ready, resolve};
 use job::{BakeJob, Outcome};
 
 /// Bakes the bodies of [`BakeRequest`]s on separate threads while the game runs.
@@ -96,6 +99,7 @@ fn work(
     mut commands: Commands,
     mut bakery: ResMut<Bakery>,
     mut models: ResMut<Assets<ModalAsset>>,
+    (meshes, server): (Option<Res<Assets<Mesh>>>, Option<Res<AssetServer>>),
     mut failures: MessageWriter<BakeFailed>,
     mut requests: Query<(NameOrEntity, &BakeRequest, &mut BakeProgress, Option<&mut ModalBody>)>,
 ) {
@@ -141,13 +145,26 @@ fn work(
             }
         }
     }
+    // Requests whose meshes are still being loaded let the others pass.
+    let mut loading = VecDeque::new();
     while bakery.running.is_none()
         && let Some(entity) = bakery.waiting.pop_front()
     {
-        if let Ok((_, request, mut progress, _)) = requests.get_mut(entity) {
-            let job = BakeJob::start(entity, request.clone(), bakery.cache.clone());
-            *progress = job.progress();
-            bakery.running = Some(job);
+        let Ok((name, request, mut progress, _)) = requests.get_mut(entity) else { continue };
+        match resolve(request, meshes.as_deref(), server.as_deref()) {
+            Ok(Ready::Now(request)) => {
+                let job = BakeJob::start(entity, request, bakery.cache.clone());
+                *progress = job.progress();
+                bakery.running = Some(job);
+            }
+            Ok(Ready::Later) => loading.push_back(entity),
+            Err(error) => {
+                error!("{name}: {error}");
+                *progress = BakeProgress::Failed { reason: error.to_string() };
+                failures.write(BakeFailed { entity, error });
+            }
         }
     }
+    loading.append(&mut bakery.waiting);
+    bakery.waiting = loading;
 }

@@ -44,6 +44,12 @@ impl BakeRequest {
         Self { shape, tets: 10_000, skin: BakeSkin::default(), config: BakeConfig::default() }
     }
 
+    /// Returns a request for a mesh of the engine, see [`BakeShape::Mesh`]. The mesh is also the
+    /// visible surface.
+    pub fn mesh(mesh: Handle<Mesh>) -> Self {
+        Self { skin: BakeSkin::Shape, ..Self::new(BakeShape::Mesh(mesh)) }
+    }
+
     /// Returns a request for a file, see [`BakeShape::File`].
     pub fn file(path: impl Into<PathBuf>) -> Self {
         Self::new(BakeShape::File(path.into()))
@@ -57,6 +63,16 @@ pub enum BakeShape {
     /// parts (`.ron`) or tetrahedra (`.msh`, `.vtk`, `.mesh`, `.veg`). A defective surface is
     /// repaired. A relative path starts in the working directory, not in the asset folder.
     File(PathBuf),
+    /// A mesh of the engine, such as `assets.load("bird.glb#Mesh0/Primitive0")`, in its own space.
+    ///
+    /// The bake begins when the mesh is loaded. What is painted as [`ATTRIBUTE_STIFFNESS`],
+    /// [`ATTRIBUTE_DENSITY`] and [`ATTRIBUTE_ANCHOR`](super::ATTRIBUTE_ANCHOR) becomes the
+    /// request's [`BakeConfig::paint`], unless that is given. A later change of the mesh does not
+    /// start a new bake.
+    ///
+    /// [`ATTRIBUTE_STIFFNESS`]: super::ATTRIBUTE_STIFFNESS
+    /// [`ATTRIBUTE_DENSITY`]: super::ATTRIBUTE_DENSITY
+    Mesh(Handle<Mesh>),
     /// A surface, a scene or tetrahedra in memory.
     Input(Arc<Input>),
     /// A signed distance function in code.
@@ -79,6 +95,7 @@ impl fmt::Debug for BakeShape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::File(path) => write!(f, "File({})", path.display()),
+            Self::Mesh(mesh) => f.debug_tuple("Mesh").field(mesh).finish(),
             Self::Input(_) => f.write_str("Input(..)"),
             Self::Distance(_) => f.write_str("Distance(..)"),
         }
@@ -164,6 +181,15 @@ pub enum BakeBodyError {
     NoSurface {
         /// The kind of the shape.
         got: &'static str,
+    },
+    /// The mesh of a [`BakeShape::Mesh`] could not be loaded.
+    #[error("the mesh of the body could not be loaded: {0}")]
+    Load(String),
+    /// The mesh of a [`BakeShape::Mesh`] has no surface that can be filled.
+    #[error("the body cannot be made from this mesh: expected {expected}")]
+    UnusableMesh {
+        /// What was expected.
+        expected: &'static str,
     },
     /// The operating system provided no threads.
     #[error("the body could not be baked: no threads were to be had: {0}")]

@@ -2,12 +2,19 @@
 
 use std::time::{Duration, Instant};
 
-use bevy::prelude::*;
+use bevy::{
+    asset::RenderAssetUsages,
+    mesh::{PrimitiveTopology, VertexAttributeValues},
+    prelude::*,
+};
 use pliant_bake::{BakeCache, BakeConfig};
 use pliant_mesh::shapes;
 
 use super::{app, model, state, tick};
-use crate::{BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeSkin, BodyState, ModalAsset, ModalBody};
+use crate::{
+    ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeSkin,
+    BodyState, ModalAsset, ModalBody,
+};
 
 fn baking_app(cache: Option<BakeCache>) -> App {
     let mut app = app();
@@ -177,4 +184,76 @@ fn a_new_bake_under_a_hand_is_held_on() {
     super::steps(&mut app, 2);
     assert_eq!(state(&app, entity).body().mode_count(), 5);
     assert!(state(&app, entity).grab_id(hand).is_some(), "the hand holds the new body");
+}
+
+/// Returns a box of the engine with vertices of their own on each face, as modelers write them.
+fn painted_box() -> Mesh {
+    let mut mesh = Mesh::from(Cuboid::new(0.4, 0.1, 0.1)).with_computed_normals();
+    let Some(VertexAttributeValues::Float32x3(positions)) = mesh.attribute(Mesh::ATTRIBUTE_POSITION) else {
+        panic!("a box has positions");
+    };
+    let (stiff, anchor): (Vec<f32>, Vec<f32>) =
+        positions.iter().map(|p| (4.0, if p[0] < 0.0 { 1.0 } else { 0.0 })).unzip();
+    mesh.insert_attribute(ATTRIBUTE_STIFFNESS, stiff);
+    mesh.insert_attribute(ATTRIBUTE_ANCHOR, anchor);
+    mesh
+}
+
+fn of_mesh(mesh: Handle<Mesh>) -> BakeRequest {
+    let config = BakeConfig { modes: 6, sites: Some(8), ..BakeConfig::default() };
+    BakeRequest { tets: 1_500, config, ..BakeRequest::mesh(mesh) }
+}
+
+/// A mesh becomes a body when it is loaded, with what is painted on it, and lets others pass until
+/// then.
+#[test]
+fn a_painted_mesh_becomes_a_body() {
+    let mut app = baking_app(None);
+    app.init_asset::<Mesh>();
+    let later = app.world().resource::<Assets<Mesh>>().reserve_handle();
+    let waiting = app.world_mut().spawn(of_mesh(later.clone())).id();
+    let other = app.world_mut().spawn(bar(4)).id();
+    assert!(matches!(wait(&mut app, other).last(), Some(BakeProgress::Done { .. })));
+    assert_eq!(progress(&app, waiting), BakeProgress::Waiting);
+    app.world_mut().resource_mut::<Assets<Mesh>>().insert(&later, painted_box()).unwrap();
+    assert!(matches!(wait(&mut app, waiting).last(), Some(BakeProgress::Done { .. })));
+
+    // The same box without painting, fixed and stiffened by numbers.
+    let config =
+        BakeConfig { young: 4e5, anchors: vec!["x<0".parse().unwrap()], ..of_mesh(Handle::default()).config };
+    let mut plain = painted_box();
+    plain.remove_attribute(ATTRIBUTE_STIFFNESS);
+    plain.remove_attribute(ATTRIBUTE_ANCHOR);
+    let plain = app.world_mut().resource_mut::<Assets<Mesh>>().add(plain);
+    let by_numbers = app.world_mut().spawn(BakeRequest { config, ..of_mesh(plain) }).id();
+    assert!(matches!(wait(&mut app, by_numbers).last(), Some(BakeProgress::Done { .. })));
+    app.update();
+    let [painted, numbers] = [waiting, by_numbers].map(|entity| {
+        let handle = app.world().get::<ModalBody>(entity).unwrap().model.clone();
+        app.world().resource::<Assets<ModalAsset>>().get(&handle).unwrap().model().clone()
+    });
+    assert!(!painted.is_free());
+    // The body's surface is that of the mesh, with its seams.
+    assert_eq!(painted.surface().positions().len(), 24);
+    for (a, b) in painted.omega().iter().zip(numbers.omega()) {
+        // The border between fixed and free lies on an edge of the painting, where it is rounded.
+        assert!((a / b - 1.0).abs() < 0.05, "{a} for {b} 1/s");
+    }
+}
+
+#[test]
+fn a_mesh_without_triangles_is_refused() {
+    let mut app = baking_app(None);
+    app.init_asset::<Mesh>();
+    let lines = Mesh::new(PrimitiveTopology::LineList, RenderAssetUsages::default())
+        .with_inserted_attribute(Mesh::ATTRIBUTE_POSITION, vec![[0.0f32; 3]; 2]);
+    let open = Mesh::from(Plane3d::default().mesh().size(1.0, 1.0));
+    for (mesh, expected) in [(lines, "a list of triangles"), (open, "meshed")] {
+        let mesh = app.world_mut().resource_mut::<Assets<Mesh>>().add(mesh);
+        let entity = app.world_mut().spawn(of_mesh(mesh)).id();
+        match wait(&mut app, entity).last() {
+            Some(BakeProgress::Failed { reason }) => assert!(reason.contains(expected), "{reason}"),
+            other => panic!("{other:?}"),
+        }
+    }
 }

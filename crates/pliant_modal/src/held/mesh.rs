@@ -30,6 +30,8 @@ pub struct SimulationMesh {
     pub displacements: Vec<i16>,
     /// Places of the surface vertices.
     pub vertices: Vec<VertexPlace>,
+    /// Factor of the moduli of each tetrahedron. Empty where all have the same moduli.
+    pub stiffness: Vec<f32>,
 }
 
 impl SimulationMesh {
@@ -69,6 +71,9 @@ impl SimulationMesh {
         length("tetrahedra", tets.min(Self::MAX_TETS), tets)?;
         length("node scales", modes, self.scales.len())?;
         length("vertex places", vertices, self.vertices.len())?;
+        if !self.stiffness.is_empty() {
+            length("tetrahedra's stiffness", tets, self.stiffness.len())?;
+        }
         let count = self.corners.len();
         for (index, tet) in self.tets.iter().enumerate() {
             if let Some(&vertex) = tet.iter().find(|&&corner| corner as usize >= count) {
@@ -85,6 +90,8 @@ impl SimulationMesh {
         value("corners", "finite meters", self.corners.iter().flatten().copied().enumerate().find(finite))?;
         let positive = |x: &(usize, f32)| !(x.1.is_finite() && x.1 > 0.0);
         value("node scales", "above 0", self.scales.iter().copied().enumerate().find(positive))?;
+        let mut stiffness = self.stiffness.iter().copied().enumerate();
+        value("tetrahedra's stiffness", "above 0", stiffness.find(positive))?;
         for (index, place) in self.vertices.iter().enumerate() {
             if place.element as usize >= tets {
                 return Err(ModelError::Vertex {
@@ -123,6 +130,11 @@ impl SimulationMesh {
                 *out = f64::from(*step) * f64::from(*scale / Self::STEPS);
             }
         }
+    }
+
+    /// Returns the factor of the moduli of a tetrahedron.
+    pub(super) fn stiffness(&self, tet: u32) -> f64 {
+        self.stiffness.get(tet as usize).map_or(1.0, |&factor| f64::from(factor))
     }
 
     /// Whether a node is anchored: no coordinate moves it.

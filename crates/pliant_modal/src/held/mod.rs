@@ -373,13 +373,13 @@ impl Region<'_> {
     /// At most about `most` quadrature points outside of the region, spread over the body, with
     /// weights whose sum is the volume there.
     fn outside(&self, size: f64, most: usize, columns: &Columns) -> Vec<Point> {
-        let mut order: Vec<([i64; 3], u32, f64)> = (0..self.mesh_elements() as u32)
+        let mut order: Vec<((i64, [i64; 3]), u32, f64)> = (0..self.mesh_elements() as u32)
             .filter(|element| self.elements.binary_search(element).is_err())
             .map(|element| {
                 let (center, volume) = self.place(element);
                 // Elements in the order of a coarse grid lie beside each other.
                 let cell: [i64; 3] = std::array::from_fn(|k| (16.0 * center[k] / size).floor() as i64);
-                (cell, element, volume)
+                ((self.octave(element), cell), element, volume)
             })
             .collect();
         order.sort_by_key(|&(cell, element, _)| (cell, element));

@@ -93,8 +93,14 @@ impl<'a> Region<'a> {
                 out
             })
             .collect();
-        let affine: Vec<Affine> =
-            elements.iter().map(|&e| Affine::new(mesh.tets[e as usize].map(corner))).collect();
+        // All energies are linear in the moduli, so their factor goes into the volume.
+        let affine: Vec<Affine> = elements
+            .iter()
+            .map(|&e| {
+                let affine = Affine::new(mesh.tets[e as usize].map(corner));
+                Affine { volume: affine.volume * mesh.stiffness(e), ..affine }
+            })
+            .collect();
         // A shape ends where an element outside begins, so that it is continuous.
         let mut uses = vec![0u32; numbers.len()];
         for &node in &connectivity {
@@ -136,11 +142,17 @@ impl<'a> Region<'a> {
         self.mesh.tets.len()
     }
 
-    /// Center and volume of an element of the mesh, m and m^3.
+    /// Octave of the moduli of an element of the mesh. Only elements of one octave may stand for
+    /// each other.
+    pub(super) fn octave(&self, element: u32) -> i64 {
+        self.mesh.stiffness(element).log2().round() as i64
+    }
+
+    /// Center of an element of the mesh, m, and its volume times the factor of its moduli, m^3.
     pub(super) fn place(&self, element: u32) -> (Vector3<f64>, f64) {
         let corners = self.mesh.tets[element as usize].map(|c| self.mesh.corners[c as usize].map(f64::from));
         let center = corners.iter().map(|&c| Vector3::from(c)).sum::<Vector3<f64>>() * 0.25;
-        (center, Affine::new(corners).volume)
+        (center, Affine::new(corners).volume * self.mesh.stiffness(element))
     }
 
     /// Spreads the weights of a patch over the nodes of the mesh.
