@@ -10,7 +10,7 @@ use std::{path::PathBuf, process::ExitCode, time::Duration};
 use bevy::{
     app::{PluginsState, ScheduleRunnerPlugin},
     camera::{RenderTarget, primitives::Aabb},
-    mesh::VertexAttributeValues,
+    mesh::{MeshVertexAttribute, VertexAttributeValues},
     prelude::*,
     render::{
         RenderApp,
@@ -28,7 +28,7 @@ use bevy::{
 };
 use pliant::{
     body::{DrawnSurface, Driven, SurfaceDeformation, SurfaceDetail, VisualState},
-    modal::ModalModel,
+    modal::{ModalModel, SurfaceMesh},
     prelude::*,
 };
 
@@ -60,11 +60,29 @@ fn studio() -> App {
 }
 
 fn pip() -> ModalModel {
-    ModalModel::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal")).unwrap()
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
+    let mut parts = ModalModel::read(path).unwrap().parts().clone();
+    // A texture that winds around Pip, so that the surface has tangents.
+    let surface = &parts.surface;
+    let wound = |p: &[f32; 3]| [p[0].atan2(p[2]), 8.0 * p[1]];
+    parts.surface = SurfaceMesh::new(
+        surface.positions().to_vec(),
+        surface.triangles().to_vec(),
+        Some(surface.positions().iter().map(wound).collect()),
+        surface.anchored().to_vec(),
+    )
+    .unwrap();
+    ModalModel::from_parts(parts).unwrap()
 }
 
-/// Returns positions and normals of a mesh from the buffer on the device.
-fn on_device(app: &App, mesh: AssetId<Mesh>) -> (Vec<Vec3>, Vec<Vec3>) {
+/// Positions, normals and tangents.
+type Shape = [Vec<Vec3>; 3];
+
+const ATTRIBUTES: [MeshVertexAttribute; 3] =
+    [Mesh::ATTRIBUTE_POSITION, Mesh::ATTRIBUTE_NORMAL, Mesh::ATTRIBUTE_TANGENT];
+
+/// Returns the vertices of a mesh from the buffer on the device. The torus has no tangents.
+fn on_device(app: &App, mesh: AssetId<Mesh>) -> Shape {
     let world = app.sub_app(RenderApp).world();
     let layout = &world.resource::<RenderAssets<RenderMesh>>().get(mesh).unwrap().layout.0;
     let slice = world.resource::<MeshAllocator>().mesh_vertex_slice(&mesh).unwrap();
@@ -84,8 +102,10 @@ fn on_device(app: &App, mesh: AssetId<Mesh>) -> (Vec<Vec3>, Vec<Vec3>) {
     device.map_buffer(&view, MapMode::Read, |result| result.unwrap());
     device.poll(PollType::wait_indefinitely()).unwrap();
     let data = view.get_mapped_range();
-    let read = |attribute: bevy::mesh::MeshVertexAttribute| -> Vec<Vec3> {
-        let index = layout.attribute_ids().iter().position(|id| *id == attribute.id).unwrap();
+    let read = |attribute: MeshVertexAttribute| -> Vec<Vec3> {
+        let Some(index) = layout.attribute_ids().iter().position(|id| *id == attribute.id) else {
+            return Vec::new();
+        };
         let offset = layout.layout().attributes[index].offset as usize;
         data.chunks_exact(stride as usize)
             .map(|vertex| {
@@ -96,16 +116,20 @@ fn on_device(app: &App, mesh: AssetId<Mesh>) -> (Vec<Vec3>, Vec<Vec3>) {
             })
             .collect()
     };
-    (read(Mesh::ATTRIBUTE_POSITION), read(Mesh::ATTRIBUTE_NORMAL))
+    ATTRIBUTES.map(read)
 }
 
-fn in_asset(app: &App, mesh: AssetId<Mesh>) -> (Vec<Vec3>, Vec<Vec3>) {
+fn in_asset(app: &App, mesh: AssetId<Mesh>) -> Shape {
     let mesh = app.world().resource::<Assets<Mesh>>().get(mesh).unwrap();
     let read = |attribute| match mesh.attribute(attribute) {
         Some(VertexAttributeValues::Float32x3(values)) => values.iter().map(|v| Vec3::from(*v)).collect(),
+        Some(VertexAttributeValues::Float32x4(values)) => {
+            values.iter().map(|&[x, y, z, _]| Vec3::new(x, y, z)).collect()
+        }
+        None => Vec::new(),
         other => panic!("{other:?}"),
     };
-    (read(Mesh::ATTRIBUTE_POSITION), read(Mesh::ATTRIBUTE_NORMAL))
+    ATTRIBUTES.map(read)
 }
 
 fn farthest(a: &[Vec3], b: &[Vec3]) -> f32 {
@@ -161,7 +185,7 @@ fn the_same_shapes(mut app: App) {
     let computed = drawing::wait_for("the compute pass runs", || {
         app.update();
         let computed: Vec<_> = meshes.iter().map(|mesh| on_device(&app, *mesh)).collect();
-        let moved: Vec<f32> = computed.iter().map(|shape| farthest(&shape.0, &rest.0)).collect();
+        let moved: Vec<f32> = computed.iter().map(|shape| farthest(&shape[0], &rest[0])).collect();
         if moved.iter().all(|moved| *moved > 0.01 * size) {
             Ok(computed)
         } else {
@@ -169,9 +193,9 @@ fn the_same_shapes(mut app: App) {
         }
     });
     for (mesh, body) in meshes.iter().zip(&bodies) {
-        assert!(farthest(&in_asset(&app, *mesh).0, &rest.0) < 1e-6 * size, "the asset is not touched");
+        assert!(farthest(&in_asset(&app, *mesh)[0], &rest[0]) < 1e-6 * size, "the asset is not touched");
         let aabb = app.world().get::<Aabb>(*body).unwrap();
-        let shape = on_device(&app, *mesh).0;
+        let [shape, ..] = on_device(&app, *mesh);
         assert!(shape.iter().all(|p| {
             let p = bevy::math::Vec3A::from(*p);
             p.cmpge(aabb.min() - 1e-5).all() && p.cmple(aabb.max() + 1e-5).all()
@@ -183,8 +207,8 @@ fn the_same_shapes(mut app: App) {
     app.insert_resource(SurfaceDeformation::Processor);
     app.update();
     app.update();
-    for (mesh, (positions, normals)) in meshes.iter().zip(&computed) {
-        let (expected, directions) = in_asset(&app, *mesh);
+    for (mesh, [positions, normals, tangents]) in meshes.iter().zip(&computed) {
+        let [expected, directions, along] = in_asset(&app, *mesh);
         let error = farthest(positions, &expected);
         assert!(error < 1e-5 * size, "off by {error} m of {size} m");
         // The error of a normal is the error of the positions divided by the length of an edge.
@@ -194,6 +218,17 @@ fn the_same_shapes(mut app: App) {
             "positions off by {:.2e} of the size, normals by {error:.2e}",
             farthest(positions, &expected) / size
         );
+        // A tangent is a unit vector across its normal. Where the texture hardly grows along the
+        // surface, its direction is rounding error.
+        assert_eq!(tangents.len(), normals.len());
+        for (tangent, normal) in tangents.iter().zip(normals) {
+            assert!((tangent.length() - 1.0).abs() < 1e-4 && tangent.dot(*normal).abs() < 1e-3);
+        }
+        let mut errors: Vec<f32> = tangents.iter().zip(&along).map(|(a, b)| a.distance(*b)).collect();
+        errors.sort_by(f32::total_cmp);
+        let most = errors[errors.len() * 999 / 1000];
+        println!("tangents off by {most:.2e} for 99.9 % of the vertices");
+        assert!(most < 1e-2, "tangents off by {most}");
     }
 
     // In a picture of 64 pixels, most modes of a distant body are left out without a visible
@@ -203,7 +238,7 @@ fn the_same_shapes(mut app: App) {
     let q: Vec<f64> = world.get::<VisualState>(bodies[0]).unwrap().q().to_vec();
     world.get_mut::<VisualState>(bodies[0]).unwrap().snap(&q).unwrap();
     app.update();
-    let error = farthest(&in_asset(&app, meshes[0]).0, &computed[0].0);
+    let error = farthest(&in_asset(&app, meshes[0])[0], &computed[0][0]);
     // The view covers 45 degrees over 64 pixels, at three meters less the radius of the body.
     let pixel = 2.0 * 3.0 * (22.5f32).to_radians().tan() / 64.0;
     assert!(error > 1e-6 * size, "every mode is drawn: {error}");
@@ -212,13 +247,13 @@ fn the_same_shapes(mut app: App) {
     let world = app.world_mut();
     world.entity_mut(bodies[0]).insert(SurfaceDetail { tolerance: 1e-5 });
     app.update();
-    let finer = farthest(&in_asset(&app, meshes[0]).0, &computed[0].0);
+    let finer = farthest(&in_asset(&app, meshes[0])[0], &computed[0][0]);
     assert!(finer < error / 50.0, "{finer} m off after {error}");
 
     // A mesh that other code changes keeps its shape under the compute pass.
     app.insert_resource(SurfaceDeformation::Compute);
     app.update();
-    let count = computed[2].0.len();
+    let count = computed[2][0].len();
     app.world_mut()
         .resource_mut::<Assets<Mesh>>()
         .get_mut(meshes[2])
@@ -226,7 +261,7 @@ fn the_same_shapes(mut app: App) {
         .insert_attribute(Mesh::ATTRIBUTE_COLOR, vec![[1.0f32, 0.0, 0.0, 1.0]; count]);
     app.update();
     app.update();
-    assert!(farthest(&on_device(&app, meshes[2]).0, &computed[2].0) < 1e-5 * size);
+    assert!(farthest(&on_device(&app, meshes[2])[0], &computed[2][0]) < 1e-5 * size);
 
     // Despawned bodies must leave no surface behind.
     for body in bodies {

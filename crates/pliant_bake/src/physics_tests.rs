@@ -19,7 +19,7 @@ fn omegas(mesh: &TetMesh, element: Element, config: &BakeConfig, average: Option
     let mut law = law(config);
     law.average_pressure = average.unwrap_or(law.average_pressure);
     let graph = fe.graph(law.average_pressure);
-    let held = support::anchored_nodes(&fe, &config.anchors).unwrap();
+    let held = support::anchored_nodes(&fe, config).unwrap();
     let (number, ordered) = elimination_order(&fe, &graph, &held);
     let matrix = fe.assemble(&law, &number, &ordered);
     let rigid = config.anchors.is_empty().then(|| {
@@ -186,7 +186,7 @@ fn modes_and_residual_flexibility_make_the_full_static_stiffness() {
         let config = BakeConfig { modes: 12, anchors, ..BakeConfig::default() };
         let fe = FeMesh::new(&mesh, Element::Tet10);
         let graph = fe.graph(false);
-        let held = support::anchored_nodes(&fe, &config.anchors).unwrap();
+        let held = support::anchored_nodes(&fe, &config).unwrap();
         let (number, ordered) = elimination_order(&fe, &graph, &held);
         let matrix = fe.assemble(&law(&config), &number, &ordered);
         let properties = MassProperties::new(&fe, config.density);

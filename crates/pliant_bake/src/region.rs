@@ -119,25 +119,30 @@ const DENSITY: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 
 /// Checks the factors of regions and painting.
 pub(crate) fn check(config: &BakeConfig) -> Result<(), BakeError> {
-    let each = |name, expected, ok: &dyn Fn(f64) -> bool, values: &mut dyn Iterator<Item = f64>| {
+    fn each(
+        name: &'static str,
+        expected: &'static str,
+        ok: &dyn Fn(f64) -> bool,
+        mut values: impl Iterator<Item = f64>,
+    ) -> Result<(), BakeError> {
         values.find(|&x| !ok(x)).map_or(Ok(()), |got| Err(BakeError::Parameter { name, expected, got }))
-    };
+    }
     let (stiff, dense) = (|x: f64| STIFFNESS.contains(&x), |x: f64| DENSITY.contains(&x));
     let regions = &config.regions;
     let count = regions.len() as f64;
-    each("regions", "at most 64", &|n| n <= 64.0, &mut std::iter::once(count))?;
-    each("stiffness of a region", "1e-6 to 1e6", &stiff, &mut regions.iter().map(|r| r.stiffness))?;
-    each("density of a region", "1e-3 to 1e3", &dense, &mut regions.iter().map(|r| r.density))?;
+    each("regions", "at most 64", &|n| n <= 64.0, std::iter::once(count))?;
+    each("stiffness of a region", "1e-6 to 1e6", &stiff, regions.iter().map(|r| r.stiffness))?;
+    each("density of a region", "1e-3 to 1e3", &dense, regions.iter().map(|r| r.density))?;
     let Some(paint) = &config.paint else { return Ok(()) };
     paint.surface.check().map_err(BakeError::Paint)?;
     let vertices = paint.surface.positions.len();
     let lengths = [&paint.stiffness, &paint.density, &paint.anchored].map(Vec::len);
     let fits = |n: f64| n == 0.0 || n == vertices as f64;
-    let mut lengths = lengths.into_iter().map(|n| n as f64);
-    each("painted values", "one for each vertex of the painted surface, or none", &fits, &mut lengths)?;
-    each("painted stiffness", "1e-6 to 1e6", &stiff, &mut paint.stiffness.iter().copied())?;
-    each("painted density", "1e-3 to 1e3", &dense, &mut paint.density.iter().copied())?;
-    each("painted anchor", "a finite weight", &f64::is_finite, &mut paint.anchored.iter().copied())
+    let lengths = lengths.into_iter().map(|n| n as f64);
+    each("painted values", "one for each vertex of the painted surface, or none", &fits, lengths)?;
+    each("painted stiffness", "1e-6 to 1e6", &stiff, paint.stiffness.iter().copied())?;
+    each("painted density", "1e-3 to 1e3", &dense, paint.density.iter().copied())?;
+    each("painted anchor", "a finite weight", &f64::is_finite, paint.anchored.iter().copied())
 }
 
 /// Value of a list at a place of the painted surface.

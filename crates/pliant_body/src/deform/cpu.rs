@@ -25,7 +25,8 @@ pub(super) struct Shape<'a> {
     pub held: Option<(&'a HeldShapes, &'a [f64])>,
 }
 
-/// Writes positions (m, body axes) and area-weighted normals of a shape into `mesh`.
+/// Writes positions (m, body axes), area-weighted normals and, for a textured surface, tangents of
+/// a shape into `mesh`.
 ///
 /// The basis is read in `precision`. `mesh` must have been made for `topology`. Returns the bounds.
 /// Returns `None` for a mesh that was replaced by one of another topology, which is left alone.
@@ -73,6 +74,13 @@ pub(super) fn write(
     let drawn = float3(mesh, Mesh::ATTRIBUTE_NORMAL.id, topology.source.len())?;
     for (drawn, &normal) in drawn.iter_mut().zip(&topology.normal) {
         *drawn = normals[normal as usize].into();
+    }
+    if let Ok(VertexAttributeValues::Float32x4(drawn)) = mesh.try_attribute_mut(Mesh::ATTRIBUTE_TANGENT.id)
+        && drawn.len() == topology.tangents.len()
+    {
+        for ((drawn, tangent), &normal) in drawn.iter_mut().zip(&topology.tangents).zip(&topology.normal) {
+            *drawn = tangent.of(positions, normals[normal as usize]);
+        }
     }
     Some(Aabb::from_min_max(low, high))
 }

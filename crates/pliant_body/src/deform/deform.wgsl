@@ -15,8 +15,9 @@ struct Surface {
     corners: u32,
     // Index of the first body of this dispatch in `jobs`.
     first: u32,
-    pad_a: u32,
-    pad_b: u32,
+    // Offset in `topology` of the tangents, one per drawn vertex, or 0 where there are none.
+    tangents: u32,
+    pad: u32,
 }
 
 struct Job {
@@ -32,6 +33,8 @@ struct Job {
     stride: u32,
     position: u32,
     normal: u32,
+    // Offset of the tangent in a vertex, in words, or NONE.
+    tangent: u32,
     // Offset in `coordinates` of the displacements besides those of the coordinates, and their
     // number: four words each, of which the first is the vertex. The vertices ascend.
     moved: u32,
@@ -45,13 +48,15 @@ struct Job {
 // block.
 @group(0) @binding(2) var<storage, read> basis: array<f32>;
 // For each drawn vertex its surface vertex and its normal, for each normal the start of its
-// corners, then the corners with three vertices each.
+// corners, then the corners with three vertices each, then for each drawn vertex the triangle of
+// its tangent, the factors of that triangle's edges, and the sign of the bitangent.
 @group(0) @binding(3) var<storage, read> topology: array<u32>;
 @group(0) @binding(4) var<storage, read> jobs: array<Job>;
 @group(0) @binding(5) var<storage, read> coordinates: array<f32>;
 @group(0) @binding(6) var<storage, read_write> positions: array<f32>;
 @group(0) @binding(7) var<storage, read_write> mesh: array<f32>;
 
+const NONE: u32 = 0xffffffffu;
 const BLOCK: u32 = 16u;
 const ROWS: u32 = 6u;
 const TAU: f32 = 6.283185307179586;
@@ -153,6 +158,30 @@ fn position_of(job: Job, vertex: u32) -> vec3<f32> {
     return vec3(positions[at], positions[at + 1u], positions[at + 2u]);
 }
 
+// Returns any unit vector across a unit vector (Duff et al. 2017).
+fn across(normal: vec3<f32>) -> vec3<f32> {
+    let side = select(-1.0, 1.0, normal.z >= 0.0);
+    let a = -1.0 / (side + normal.z);
+    let b = normal.x * normal.y * a;
+    return vec3(b, side + normal.y * normal.y * a, -normal.y);
+}
+
+// Returns the tangent of a drawn vertex with this normal.
+fn tangent_of(job: Job, drawn: u32, normal: vec3<f32>) -> vec4<f32> {
+    let at = surface.tangents + 6u * drawn;
+    let a = position_of(job, topology[at]);
+    let b = position_of(job, topology[at + 1u]);
+    let c = position_of(job, topology[at + 2u]);
+    let along = bitcast<f32>(topology[at + 3u]) * (b - a) + bitcast<f32>(topology[at + 4u]) * (c - a);
+    let flat_along = along - normal * dot(normal, along);
+    let largest = max(max(abs(flat_along.x), abs(flat_along.y)), abs(flat_along.z));
+    var unit = across(normal);
+    if largest > 0.0 {
+        unit = normalize(flat_along / largest);
+    }
+    return vec4(unit, bitcast<f32>(topology[at + 5u]));
+}
+
 @compute @workgroup_size(64)
 fn write_mesh(@builtin(global_invocation_id) id: vec3<u32>) {
     let drawn = id.x;
@@ -187,4 +216,11 @@ fn write_mesh(@builtin(global_invocation_id) id: vec3<u32>) {
     mesh[to + job.normal] = normal.x;
     mesh[to + job.normal + 1u] = normal.y;
     mesh[to + job.normal + 2u] = normal.z;
+    if surface.tangents != 0u && job.tangent != NONE {
+        let tangent = tangent_of(job, drawn, normal);
+        mesh[to + job.tangent] = tangent.x;
+        mesh[to + job.tangent + 1u] = tangent.y;
+        mesh[to + job.tangent + 2u] = tangent.z;
+        mesh[to + job.tangent + 3u] = tangent.w;
+    }
 }

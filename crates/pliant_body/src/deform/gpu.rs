@@ -34,7 +34,7 @@ use bevy::{
     },
 };
 
-use super::drawing::Drawing;
+use super::{drawing::Drawing, topology::Tangent};
 
 /// Maximum size of the scratch positions of one dispatch, bytes. Bodies beyond it need further
 /// dispatches.
@@ -163,7 +163,8 @@ struct GpuSurface {
     starts: u32,
     corners: u32,
     first: u32,
-    pad: UVec2,
+    tangents: u32,
+    pad: u32,
 }
 
 /// The struct `Job` of `deform.wgsl`.
@@ -177,6 +178,7 @@ struct DeformJob {
     stride: u32,
     position: u32,
     normal: u32,
+    tangent: u32,
     moved: u32,
     moved_count: u32,
 }
@@ -212,6 +214,11 @@ impl Resident {
         words.extend(&starts);
         let corners_at = words.len() as u32;
         words.extend(corners.iter().flatten());
+        let tangents_at = if topology.tangents.is_empty() { 0 } else { words.len() as u32 };
+        for Tangent { triangle, edges, sign } in &topology.tangents {
+            words.extend(triangle);
+            words.extend([edges[0], edges[1], *sign].map(f32::to_bits));
+        }
         Some(Self {
             of: Arc::downgrade(drawing),
             rest: buffer("pliant rest", bytemuck::cast_slice(drawing.model.surface().positions())),
@@ -224,7 +231,8 @@ impl Resident {
                 starts: starts_at,
                 corners: corners_at,
                 first: 0,
-                pad: UVec2::ZERO,
+                tangents: tangents_at,
+                pad: 0,
             },
         })
     }
@@ -315,6 +323,7 @@ struct BufferSlot {
     stride: u32,
     position: u32,
     normal: u32,
+    tangent: Option<u32>,
 }
 
 fn place(
@@ -342,6 +351,7 @@ fn place(
         stride: (stride % 4 == 0).then_some((stride / 4) as u32)?,
         position: offset(Mesh::ATTRIBUTE_POSITION)?,
         normal: offset(Mesh::ATTRIBUTE_NORMAL)?,
+        tangent: offset(Mesh::ATTRIBUTE_TANGENT),
     })
 }
 
@@ -441,6 +451,7 @@ fn prepare(
             stride: place.stride,
             position: place.position,
             normal: place.normal,
+            tangent: place.tangent.unwrap_or(u32::MAX),
             moved: (device.coordinates.len() + shape.wanted.q.len()) as u32,
             moved_count: shape.wanted.moved.len() as u32,
         });
@@ -556,6 +567,7 @@ mod tests {
         let topology = &drawing.topology;
         let (starts, corners) = topology.corners();
         assert_eq!(topology.words(), 2 * topology.source.len() + starts.len() + 3 * corners.len());
+        assert!(topology.tangents.is_empty(), "the bar has no texture");
         let bytes = 4 * topology.words() as u64;
         let basis = size_of_val(drawing.model.basis().rows().unwrap()) as u64;
         assert!(bytes > basis && bytes > 48 * topology.source.len() as u64, "{bytes}, {basis}");

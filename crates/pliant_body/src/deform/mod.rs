@@ -201,7 +201,9 @@ fn new_mesh(model: &ModalModel, topology: &Topology) -> Mesh {
     match surface.uvs() {
         Some(uvs) => {
             let uvs: Vec<[f32; 2]> = topology.source.iter().map(|&v| uvs[v as usize]).collect();
+            let tangents = vec![[1.0, 0.0, 0.0, 1.0]; uvs.len()];
             mesh.with_inserted_attribute(Mesh::ATTRIBUTE_UV_0, uvs)
+                .with_inserted_attribute(Mesh::ATTRIBUTE_TANGENT, tangents)
         }
         None => mesh,
     }
