@@ -65,8 +65,8 @@ pub struct Body {
     /// Motion of the anchors over the next step.
     motion: FrameMotion,
     /// The hands. `grabs` holds their identifiers in the same order.
-    hands: Vec<Hand>,
-    grabs: Vec<GrabEntry>,
+    pub(crate) hands: Vec<Hand>,
+    pub(crate) grabs: Vec<GrabEntry>,
     next_grab: u64,
     /// What the body may touch, and its contacts.
     contacts: Contacts,
@@ -78,12 +78,12 @@ pub struct Body {
 }
 
 #[derive(Debug, Clone)]
-struct GrabEntry {
-    id: GrabId,
-    target: Vector3<f64>,
+pub(crate) struct GrabEntry {
+    pub(crate) id: GrabId,
+    pub(crate) target: Vector3<f64>,
     /// The target of the previous step, or `None` before the first step of the grab.
-    last_target: Option<Vector3<f64>>,
-    config: GrabConfig,
+    pub(crate) last_target: Option<Vector3<f64>>,
+    pub(crate) config: GrabConfig,
 }
 
 impl Body {

@@ -53,6 +53,7 @@ mod moments;
 mod nonlinear;
 mod patch;
 mod relaxation;
+mod saved;
 mod simd;
 mod step;
 mod surface;
@@ -75,6 +76,7 @@ pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHa
 pub use nonlinear::{ElasticEnergy, Hyperelastic, Material, ReducedElasticity, positive_tangent};
 pub use patch::Patch;
 pub use relaxation::{Relaxation, ViscoelasticCoefficients};
+pub use saved::SavedBody;
 pub use step::{
     Elasticity, Frame, FrameMotion, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load,
     RigidMotion, State, StepReport, StepSettings,

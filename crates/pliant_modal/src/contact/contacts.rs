@@ -3,12 +3,13 @@
 use std::sync::Arc;
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 
 use super::{Bent, Cloud, ContactSites, Memory, ObstacleShape, Touching};
 use crate::{Hand, StepError};
 
 /// What a body touches.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Touched {
     /// The obstacle at this index of the body's list.
     Obstacle(usize),
@@ -17,7 +18,7 @@ pub enum Touched {
 }
 
 /// A contact of the last step that carried force.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Contact {
     /// What the body touches.
     pub other: Touched,

@@ -1,12 +1,14 @@
 //! One contact in a step: a site of a body at an obstacle or at another body.
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::{Touched, cone::Status, surface_field::Carriers, surface_field::Place};
-use crate::step::Tangent;
+use crate::{saved::PlainMemory, step::Tangent};
 
 /// A contact of the last step.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(from = "PlainMemory", into = "PlainMemory")]
 pub(crate) struct Memory {
     pub(crate) other: Touched,
     pub(crate) site: usize,

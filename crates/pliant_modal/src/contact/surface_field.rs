@@ -97,7 +97,7 @@ pub(crate) struct Bent {
 }
 
 /// A place of the rest surface.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct Place {
     facet: u32,
     /// Weights of the corners, with the sum 1.

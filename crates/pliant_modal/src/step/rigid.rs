@@ -4,11 +4,13 @@
 //! motion.
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 
 use crate::{ModalModel, StepError, error::finite};
 
 /// Pose and momentum of a body. The reference point is the center of mass at rest.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "PlainFrame", into = "PlainFrame")]
 pub struct Frame {
     /// Center of mass at rest, m, body axes. `position` is the world position of this point.
     pivot: Vector3<f64>,
@@ -18,6 +20,42 @@ pub struct Frame {
     /// Angular momentum about the center of mass, kg m^2/s, world axes. It is stored instead of the
     /// angular velocity, so that flight conserves it up to rounding.
     spin: Vector3<f64>,
+}
+
+/// The form of a [`Frame`] in a file: its fields, with the rotation as x, y, z, w.
+#[derive(Serialize, Deserialize)]
+struct PlainFrame {
+    pivot: [f64; 3],
+    position: [f64; 3],
+    rotation: [f64; 4],
+    velocity: [f64; 3],
+    spin: [f64; 3],
+}
+
+impl From<Frame> for PlainFrame {
+    fn from(frame: Frame) -> Self {
+        let Frame { pivot, position, velocity, spin, .. } = frame;
+        let [pivot, position, velocity, spin] = [pivot, position, velocity, spin].map(Into::into);
+        Self { pivot, position, rotation: frame.orientation(), velocity, spin }
+    }
+}
+
+impl TryFrom<PlainFrame> for Frame {
+    type Error = StepError;
+
+    fn try_from(plain: PlainFrame) -> Result<Self, StepError> {
+        let PlainFrame { pivot, position, rotation, velocity, spin } = plain;
+        let [x, y, z, w] = rotation;
+        let exact = Quaternion::new(w, x, y, z);
+        // To normalize a rotation of length 1 again would change its last bits.
+        let is_unit = (exact.norm() - 1.0).abs() < 1e-9;
+        let rotation = if is_unit { UnitQuaternion::new_unchecked(exact) } else { unit(rotation)? };
+        let [pivot, position, velocity, spin] = [pivot, position, velocity, spin].map(Vector3::from);
+        let frame = Self { pivot, position, rotation, velocity, spin };
+        finite("frame pivot", pivot.as_slice())?;
+        frame.check()?;
+        Ok(frame)
+    }
 }
 
 impl Default for Frame {

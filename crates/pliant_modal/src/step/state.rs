@@ -1,11 +1,13 @@
 //! The dynamic state of a body.
 
+use serde::{Deserialize, Serialize};
+
 use super::Frame;
 
 /// The state of a body at one tick.
 ///
 /// All slices have one entry per stepped mode. `z` is empty where the material is elastic.
-#[derive(Debug, PartialEq, Default)]
+#[derive(Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct State {
     /// Modal coordinates, kg^1/2 m.
     pub q: Vec<f64>,
