@@ -11,10 +11,7 @@ use bevy::{
     transform::TransformPlugin,
     world_serialization::serde::WorldDeserializer,
 };
-use pliant::{
-    modal::State,
-    prelude::*,
-};
+use pliant::{modal::State, prelude::*};
 use serde::de::DeserializeSeed;
 
 const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");

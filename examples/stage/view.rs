@@ -101,9 +101,10 @@ fn lay_floor(
 
 /// Draws lines, such as hands and forces, over everything, because a reaction points into the body.
 fn set_gizmos(mut store: ResMut<GizmoConfigStore>) {
-    let (config, _) = store.config_mut::<DefaultGizmoConfigGroup>();
-    config.depth_bias = -1.0;
-    config.line.width = 3.0;
+    for (_, config, _) in store.iter_mut() {
+        config.depth_bias = -1.0;
+        config.line.width = 3.0;
+    }
 }
 
 fn orbit(

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use bevy::{
     asset::{Asset, AssetLoader, LoadContext, io::Reader},
-    reflect::TypePath,
+    reflect::{Reflect, TypePath},
 };
 use pliant_modal::{FileError, ModalModel};
 use thiserror::Error;
@@ -14,7 +14,9 @@ use thiserror::Error;
 /// The asset holds the modes, the surface and the quantities measured by the bake. The loader makes
 /// it from a `.modal` file (`asset_server.load("bodies/imp.modal")`). Code makes it from a baked or
 /// received model: `assets.add(ModalAsset::from(model))`.
-#[derive(Asset, TypePath, Clone, Debug)]
+#[derive(Asset, Reflect, Clone, Debug)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone)]
 pub struct ModalAsset(pub Arc<ModalModel>);
 
 impl From<ModalModel> for ModalAsset {

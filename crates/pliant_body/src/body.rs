@@ -3,7 +3,13 @@
 
 use std::sync::Arc;
 
-use bevy::{math::Affine3A, prelude::*, reflect::reflect_remote};
+use bevy::{
+    asset::HandleTemplate,
+    ecs::template::{SpecializeFromTemplate, Template, TemplateContext},
+    math::Affine3A,
+    prelude::*,
+    reflect::reflect_remote,
+};
 use pliant_modal::{
     Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings,
 };
@@ -36,7 +42,7 @@ use crate::{Inertia, ModalAsset, VisualState, grab::GrabHold};
 /// the model stays the same. A change that cannot make a body is refused once
 /// ([`BodyRefused`](crate::BodyRefused)), and the body keeps its previous settings.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
-#[reflect(Component, Default, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[require(Transform, Visibility, Driven, Inertia)]
 pub struct ModalBody {
     /// The baked body. A new handle, or a new asset behind the handle, makes a new body at rest.
@@ -71,6 +77,51 @@ impl Default for ModalBody {
         Self::new(Handle::default())
     }
 }
+
+/// The [`ModalBody`] of a scene in Bevy's notation, where an asset is named by its path:
+/// `bsn! { ModalBody { model: "pip.modal" } }`. The fields and their defaults are those of
+/// [`ModalBody`].
+#[expect(missing_docs, reason = "the fields are those of ModalBody")]
+pub struct ModalBodyTemplate {
+    pub model: HandleTemplate<ModalAsset>,
+    pub settings: StepSettings,
+    pub modes: Option<usize>,
+    pub half_basis: bool,
+    pub held_shapes: bool,
+    pub rest_speed: f64,
+}
+
+impl Default for ModalBodyTemplate {
+    fn default() -> Self {
+        let ModalBody { settings, modes, half_basis, held_shapes, rest_speed, .. } = ModalBody::default();
+        let model = HandleTemplate::default();
+        Self { model, settings, modes, half_basis, held_shapes, rest_speed }
+    }
+}
+
+impl Template for ModalBodyTemplate {
+    type Output = ModalBody;
+
+    fn build_template(&self, context: &mut TemplateContext) -> Result<ModalBody> {
+        let &Self { settings, modes, half_basis, held_shapes, rest_speed, .. } = self;
+        let model = self.model.build_template(context)?;
+        Ok(ModalBody { model, settings, modes, half_basis, held_shapes, rest_speed })
+    }
+
+    fn clone_template(&self) -> Self {
+        let &Self { settings, modes, half_basis, held_shapes, rest_speed, .. } = self;
+        let model = self.model.clone_template();
+        Self { model, settings, modes, half_basis, held_shapes, rest_speed }
+    }
+}
+
+impl FromTemplate for ModalBody {
+    type Template = ModalBodyTemplate;
+}
+
+// Bevy makes a template of every type that is `Default`, `Clone` and `Unpin`. This bound, which
+// never holds, keeps it from this one. Bevy's derive for templates does the same.
+impl Unpin for ModalBody where for<'a> [()]: SpecializeFromTemplate {}
 
 impl ModalBody {
     /// Returns a body of `model` with all default settings.
@@ -174,10 +225,20 @@ pub enum Driven {
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct NoPointerGrab;
 
+/// The body of an entity is there: its model is loaded, or a new one has replaced it. Observe it on
+/// the body's entity or on all.
+#[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub struct BodyReady {
+    /// The entity of the [`ModalBody`].
+    pub entity: Entity,
+}
+
 /// A simulated body.
 ///
 /// The plugin adds this component to a [`ModalBody`] when the model's asset is loaded. Reflection
-/// shows the state flags but not the solver, which [`body`](Self::body) returns.
+/// shows the state flags but not the solver, which [`body`](Self::body) returns. A world that is
+/// saved by reflection has [`SavedState`](crate::SavedState) in its place.
 #[derive(Component, Reflect, Debug)]
 #[reflect(Component, from_reflect = false)]
 pub struct BodyState {

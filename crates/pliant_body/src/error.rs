@@ -34,6 +34,10 @@ pub enum BodyError {
     /// The settings of a [`ModalBody`](crate::ModalBody) do not make a body of this model.
     #[error("the body could not be made from its model and settings: {0}")]
     Build(StepError),
+    /// The [`SavedState`](crate::SavedState) of a loaded body does not fit its model. The body
+    /// starts at rest.
+    #[error("the saved state of the body does not fit: {0}; it starts at rest")]
+    Saved(StepError),
     /// A step failed. The body keeps the state before it.
     #[error("the step was refused: {0}")]
     Step(StepError),
@@ -87,11 +91,11 @@ pub enum BodyError {
     },
 }
 
-/// Reports a refused input of a user or a remote source.
+/// Reports a refused input of a user or a remote source. Observe it on the entity or on all.
 ///
-/// The plugin writes this message and logs it once with the entity's name.
-#[derive(Message, Reflect, Debug)]
-#[reflect(from_reflect = false)]
+/// The plugin triggers this event once and logs it with the entity's name.
+#[derive(EntityEvent, Reflect, Debug)]
+#[reflect(Debug, from_reflect = false)]
 pub struct BodyRefused {
     /// The entity of the refused component, or the entity that a message named: a body, a grab or a
     /// surface anchor.

@@ -2,6 +2,7 @@
 //! hand.
 
 use bevy::{math::DVec3, prelude::*};
+use serde::{Deserialize, Serialize};
 
 /// A grab of a patch of a body's surface.
 ///
@@ -21,8 +22,8 @@ use bevy::{math::DVec3, prelude::*};
 ///
 /// This app does not act on a grab of a [`Driven::Remote`](crate::Driven::Remote) body. The source
 /// that drives the body reads the grab and writes the force.
-#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Component, Clone, PartialEq)]
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[require(GrabForce)]
 pub struct Grab {
     /// Surface vertex at the middle of the patch: an index into the model's surface positions.
@@ -61,7 +62,7 @@ impl Grab {
 }
 
 /// A [`Grab`] without its target.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(crate) struct GrabHold {
     pub vertex: u32,
     pub radius: f64,
@@ -80,14 +81,14 @@ impl GrabHold {
 }
 
 /// The body that a grab holds.
-#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
-#[reflect(Component, Clone, PartialEq)]
+#[derive(Component, FromTemplate, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Debug, Clone, PartialEq)]
 #[relationship(relationship_target = Grabs)]
 pub struct GrabOf(#[entities] pub Entity);
 
 /// The grabs on a body, oldest first. Despawning the body also despawns its grabs.
 #[derive(Component, Reflect, Debug, Default)]
-#[reflect(Component)]
+#[reflect(Component, Debug, Default)]
 #[relationship_target(relationship = GrabOf, linked_spawn)]
 pub struct Grabs(Vec<Entity>);
 
@@ -98,11 +99,35 @@ impl Grabs {
     }
 }
 
+/// A grab took hold of a body that this app steps. Observe it on the body's entity or on all.
+///
+/// A change of a held [`Grab`] is no event, and neither is a grab of a body that was saved and
+/// loaded. A grab that finds the body full takes hold when a place is free.
+#[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub struct Grabbed {
+    /// The entity of the body.
+    pub entity: Entity,
+    /// The entity of the [`Grab`].
+    pub grab: Entity,
+}
+
+/// A grab let go of a body that this app steps, or the body is gone. Observe it on the body's
+/// entity or on all.
+#[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub struct Released {
+    /// The entity of the body.
+    pub entity: Entity,
+    /// The entity of the [`Grab`], which may be gone.
+    pub grab: Entity,
+}
+
 /// The force on the hand, published in every tick for every [`Grab`].
 ///
 /// The values are zero while the body does not exist.
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
-#[reflect(Component, Default, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct GrabForce {
     /// The reaction: the force that the body exerts on the hand, N, world axes. Default: zero.
     pub force: DVec3,

@@ -25,7 +25,7 @@
 //! | [`Inertia`], [`RideOn`]: how strongly it feels its entity move, and a bone that it rides on | |
 //! | [`SurfaceAnchor`] on another entity: it sits on the surface | its `Transform` |
 //! | [`Driven::Remote`]: another source moves the body | [`PliantTick`]: the number of the step |
-//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: sharp edges, level of detail, GPU or CPU (feature `render`) | [`BodyRefused`]: a refused input with its error |
+//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: sharp edges, level of detail, GPU or CPU (feature `render`) | [`BodyReady`], [`Grabbed`], [`Released`], [`BodyRefused`]: events on the body for observers; the last has a refused input with its error |
 //!
 //! The crate does not depend on a network, a device, a viewer or a panel. Those crates depend on
 //! this one. The bodies follow Bevy's time: pausing `Time<Virtual>` pauses them, and
@@ -63,6 +63,7 @@ mod picking;
 mod pointer;
 mod ride_on;
 mod riding;
+mod saved;
 mod step;
 mod surface_anchor;
 #[cfg(test)]
@@ -80,13 +81,13 @@ pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 #[cfg(feature = "bake")]
 pub use bake::{
     ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeBodyError, BakeFailed, BakePlugin,
-    BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
+    BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage, Bakery,
 };
-pub use body::{BodyState, Driven, ModalBody, NoPointerGrab};
+pub use body::{BodyReady, BodyState, Driven, ModalBody, ModalBodyTemplate, NoPointerGrab};
 #[cfg(feature = "render")]
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
-pub use grab::{Grab, GrabForce, GrabOf, Grabs};
+pub use grab::{Grab, GrabForce, GrabOf, Grabbed, Grabs, Released};
 pub use held::HeldShapesCache;
 pub use impulse::{Impulse, Push};
 pub use inertia::{Inertia, Teleport};
@@ -98,6 +99,7 @@ pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSetting
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use ride_on::RideOn;
 pub use riding::RidingPlugin;
+pub use saved::SavedState;
 pub use step::PliantTick;
 pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
 pub use visual::{Pose, VisualState};
@@ -171,6 +173,13 @@ impl Default for PliantBodyPlugin {
     }
 }
 
+/// The gizmos of Pliant: targets of pointers, forces of tools. Change or switch them off with
+/// Bevy's `GizmoConfigStore`.
+#[cfg(feature = "render")]
+#[derive(Reflect, Debug, Default, GizmoConfigGroup)]
+#[reflect(Debug, Default)]
+pub struct PliantGizmos;
+
 /// Returns whether a schedule belongs to the fixed loop.
 fn is_fixed(schedule: InternedScheduleLabel) -> bool {
     [
@@ -188,7 +197,9 @@ impl Plugin for PliantBodyPlugin {
         #[cfg(feature = "picking")]
         picking::build(app);
         let fixed = is_fixed(self.schedule);
+        saved::register(app);
         app.init_asset::<ModalAsset>()
+            .register_asset_reflect::<ModalAsset>()
             .init_asset_loader::<ModalAssetLoader>()
             .register_type::<ModalBody>()
             .register_type::<Driven>()
@@ -199,13 +210,14 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<GrabForce>()
             .register_type::<Pose>()
             .register_type::<PliantTick>()
-            .register_type::<BodyState>()
             .register_type::<VisualState>()
             .register_type::<BodyRefused>()
+            .register_type::<BodyReady>()
+            .register_type::<Grabbed>()
+            .register_type::<Released>()
             .register_type::<SingleSteps>()
             .register_type::<Impulse>()
             .register_type::<Push>()
-            .add_message::<BodyRefused>()
             .add_message::<SingleSteps>()
             .add_message::<Impulse>()
             .add_message::<Push>()
@@ -267,6 +279,9 @@ impl Plugin for PliantBodyPlugin {
 
     #[cfg(feature = "render")]
     fn finish(&self, app: &mut App) {
+        if app.is_plugin_added::<bevy::gizmos::GizmoPlugin>() {
+            app.init_gizmo_group::<PliantGizmos>();
+        }
         deform::finish(app);
     }
 }

@@ -167,7 +167,7 @@ fn drag(
 
 #[cfg(feature = "render")]
 fn draw(
-    mut gizmos: Gizmos,
+    mut gizmos: Gizmos<crate::PliantGizmos>,
     settings: Res<PointerGrab>,
     held: Query<(&PointerHeld, &Grab, &crate::GrabForce)>,
 ) {

@@ -27,7 +27,7 @@ use crate::Teleport;
 /// }
 /// # #[derive(Component)] struct WorldAssetRoot;
 /// ```
-#[derive(Component, Reflect, Debug, Clone, PartialEq, Eq)]
+#[derive(Component, FromTemplate, Reflect, Debug, Clone, PartialEq, Eq)]
 #[reflect(Component, Debug, Clone, PartialEq)]
 #[require(Transform)]
 pub struct RideOn {

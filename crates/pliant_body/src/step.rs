@@ -1,21 +1,20 @@
 //! The fixed step: builds, places, grabs and steps the bodies, and publishes the results.
 
-use std::{
-    sync::{Arc, Weak},
-    time::Instant,
-};
+use std::sync::{Arc, Weak};
 
 use bevy::{
     diagnostic::Diagnostics,
     ecs::{name::NameOrEntityItem, system::SystemParam},
     math::{DQuat, DVec3},
+    platform::time::Instant,
     prelude::*,
 };
 use pliant_modal::{Body, BodyConfig, GrabConfig, Islands, ModalModel, Patch, StepError, Together, Touched};
 
 use crate::{
-    AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,
-    ModalBody, Pose, STEP_TIME, VisualState, body::HeldBody,
+    AWAKE_BODIES, BodyError, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed,
+    Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, Released, STEP_TIME, SavedState, VisualState,
+    body::HeldBody,
 };
 
 /// The tick: the number of steps that the schedule of the bodies has made.
@@ -41,26 +40,33 @@ pub(crate) struct BuildRefused(Weak<ModalModel>);
 const REST_AFTER: f64 = 0.5;
 
 #[derive(SystemParam)]
-pub(crate) struct Refusals<'w> {
-    messages: MessageWriter<'w, BodyRefused>,
+pub(crate) struct Refusals<'w, 's> {
+    commands: Commands<'w, 's>,
 }
 
-impl Refusals<'_> {
+impl Refusals<'_, '_> {
     pub fn report(&mut self, name: &impl std::fmt::Display, entity: Entity, error: BodyError) {
         warn!("{name}: {error}");
-        self.messages.write(BodyRefused { entity, error });
+        self.commands.trigger(BodyRefused { entity, error });
     }
 }
 
 /// The requested body and the existing body of an entity.
-type Buildable =
-    (NameOrEntity, Ref<'static, ModalBody>, Option<&'static mut BodyState>, Option<&'static BuildRefused>);
+type Buildable = (
+    NameOrEntity,
+    Ref<'static, ModalBody>,
+    Option<&'static mut BodyState>,
+    Option<&'static BuildRefused>,
+    Option<&'static SavedState>,
+    Option<&'static VisualState>,
+);
 
 pub(crate) fn build_bodies(
     mut commands: Commands,
     models: Res<Assets<ModalAsset>>,
     stepping: Res<Stepping>,
     fixed: Option<Res<Time<Fixed>>>,
+    mut shapes: ResMut<HeldShapesCache>,
     mut refusals: Refusals,
     mut bodies: Query<Buildable>,
 ) {
@@ -68,10 +74,27 @@ pub(crate) fn build_bodies(
         Some(fixed) if stepping.fixed => fixed.timestep().as_secs_f64(),
         _ => 1.0 / 60.0,
     };
-    for (name, body, state, refused) in &mut bodies {
+    for (name, body, state, refused, saved, visual) in &mut bodies {
         // While the asset of a new handle is not loaded, the old body stays, if there is one.
         let Some(ModalAsset(model)) = models.get(&body.model) else { continue };
         let modes = body.modes.unwrap_or(usize::MAX).min(model.mode_count());
+        if let Some(saved) = saved {
+            // The own shapes of held patches are waited for.
+            let Some(restored) = saved.restore(&body, model, &mut shapes) else { continue };
+            let mut entity = commands.entity(name.entity);
+            entity.try_remove::<SavedState>();
+            match restored {
+                Ok(state) => {
+                    if !visual.is_some_and(|visual| visual.fits(modes)) {
+                        entity.try_insert(VisualState::new(state.body.q()));
+                    }
+                    entity.try_insert(state).try_remove::<BuildRefused>();
+                    commands.trigger(BodyReady { entity: name.entity });
+                    continue;
+                }
+                Err(error) => refusals.report(&name, name.entity, BodyError::Saved(error)),
+            }
+        }
         match state {
             Some(state) if Arc::ptr_eq(state.model(), model) && state.body.mode_count() == modes => {
                 if body.is_changed() {
@@ -101,6 +124,7 @@ pub(crate) fn build_bodies(
                             .entity(name.entity)
                             .try_insert((BodyState::new(new), visual))
                             .try_remove::<BuildRefused>();
+                        commands.trigger(BodyReady { entity: name.entity });
                     }
                     Err(error) => {
                         refusals.report(&name, name.entity, BodyError::Build(error));
@@ -138,7 +162,7 @@ fn carry_over(name: &NameOrEntityItem, old: &Body, mut new: Body) -> Body {
 /// Removes the simulation components of an entity whose [`ModalBody`] was removed.
 pub(crate) fn drop_states(removed: On<Remove, ModalBody>, mut commands: Commands) {
     if let Ok(mut entity) = commands.get_entity(removed.entity) {
-        entity.try_remove::<(BodyState, VisualState, BuildRefused)>();
+        entity.try_remove::<(BodyState, VisualState, BuildRefused, SavedState)>();
     }
 }
 
@@ -147,12 +171,18 @@ pub(crate) fn clear_grab_force(removed: On<Remove, GrabOf>, mut forces: Query<&m
     feel_nothing(removed.entity, &mut forces);
 }
 
-/// Sets the forces of the grabs on a removed body to zero.
+/// Sets the forces of the grabs on a removed body to zero, and tells that they are released.
 pub(crate) fn lose_body(
     removed: On<Remove, BodyState>,
+    mut commands: Commands,
+    bodies: Query<&BodyState>,
     grabs: Query<&Grabs>,
     mut forces: Query<&mut GrabForce>,
 ) {
+    let held = bodies.get(removed.entity).map_or(&[][..], |state| &state.held[..]);
+    for held in held.iter().filter(|held| held.id.is_some()) {
+        commands.trigger(Released { entity: removed.entity, grab: held.entity });
+    }
     for &grab in grabs.get(removed.entity).map_or(&[][..], Grabs::entities) {
         feel_nothing(grab, &mut forces);
     }
@@ -220,12 +250,13 @@ pub(crate) fn place_bodies(
 /// Synchronizes the solver's grabs with the grab entities: adds new grabs, releases removed grabs
 /// and passes on the targets. A grab that finds the body full waits until a slot is free.
 pub(crate) fn hold_bodies(
+    mut commands: Commands,
     mut refusals: Refusals,
-    mut bodies: Query<(&mut BodyState, &Driven, Option<&Grabs>)>,
+    mut bodies: Query<(Entity, &mut BodyState, &Driven, Option<&Grabs>)>,
     grabs: Query<(NameOrEntity, &Grab)>,
     mut forces: Query<&mut GrabForce>,
 ) {
-    for (mut state, driven, list) in &mut bodies {
+    for (of, mut state, driven, list) in &mut bodies {
         let wanted = match (driven, list) {
             (Driven::Local, Some(list)) => list.entities(),
             _ => &[],
@@ -235,6 +266,8 @@ pub(crate) fn hold_bodies(
         }
         let BodyState { body, held, scale, quiet, resting, .. } = &mut *state;
         let before = body.grabs().count();
+        // Grabs whose settings have changed take hold anew, which is no event.
+        let mut again = Vec::new();
         held.retain(|held| {
             let grab = wanted.contains(&held.entity).then(|| grabs.get(held.entity).ok()).flatten();
             if grab.is_none() {
@@ -243,6 +276,10 @@ pub(crate) fn hold_bodies(
             let stays = grab.is_some_and(|(_, grab)| grab.hold().is(&held.hold));
             if let (false, Some(id)) = (stays, held.id) {
                 body.release(id);
+                match grab {
+                    Some(_) => again.push(held.entity),
+                    None => commands.trigger(Released { entity: of, grab: held.entity }),
+                }
             }
             stays
         });
@@ -260,6 +297,11 @@ pub(crate) fn hold_bodies(
                 let taken = take_hold(body, grab);
                 held.waiting = matches!(taken, Err(BodyError::Grab(StepError::TooManyGrabs { .. })));
                 held.id = taken.map_err(|error| refusals.report(&name, entity, error)).ok();
+                match (again.contains(&entity), held.id.is_some()) {
+                    (false, true) => commands.trigger(Grabbed { entity: of, grab: entity }),
+                    (true, false) => commands.trigger(Released { entity: of, grab: entity }),
+                    _ => {}
+                }
             }
             let Some(id) = held.id else { continue };
             // A target can be invalid only by being not finite.

@@ -29,7 +29,7 @@ use crate::{BodyError, BodyState, VisualState, step::Refusals};
 ///     commands.spawn((SurfaceAnchor::nearest(body, Vec3::new(0.0, 0.5, 0.0)), Transform::default()));
 /// }
 /// ```
-#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[derive(Component, FromTemplate, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Debug, Clone, PartialEq)]
 #[require(Transform)]
 pub struct SurfaceAnchor {
@@ -42,7 +42,7 @@ pub struct SurfaceAnchor {
 
 /// A place on the surface of a body.
 #[derive(Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Debug, Clone, PartialEq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
 pub enum SurfacePlace {
     /// The place nearest to this point at rest, m, axes of the body. The plugin replaces it by the
     /// place that it finds.
@@ -54,6 +54,13 @@ pub enum SurfacePlace {
         /// Weights of its three corners, with the sum 1.
         weights: Vec3,
     },
+}
+
+impl Default for SurfacePlace {
+    /// The place nearest to the origin.
+    fn default() -> Self {
+        Self::Nearest(Vec3::ZERO)
+    }
 }
 
 impl SurfaceAnchor {

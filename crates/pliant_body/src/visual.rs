@@ -11,7 +11,8 @@ use pliant_modal::HeldShapes;
 use crate::{BodyError, BodyState, step::Stepping};
 
 /// The pose of a free body, in world axes.
-#[derive(Reflect, Debug, Clone, Copy, PartialEq)]
+#[derive(Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
 pub struct Pose {
     /// World position of the model's origin, m.
     pub origin: DVec3,
@@ -28,15 +29,14 @@ pub struct Pose {
 /// drawn from this state in the same way as for a local body.
 ///
 /// Every state has one coordinate per kept mode, kg^1/2 m.
-#[derive(Component, Reflect, Debug)]
-#[reflect(Component, from_reflect = false)]
+///
+/// A saved state has no own shapes of held patches. The next tick pushes them again.
+#[derive(Component, Reflect, Debug, Default)]
+#[reflect(Component, Debug, Default)]
 pub struct VisualState {
     // The three vectors have the same length. Nothing outside may change the length of one of them.
-    #[reflect(ignore)]
     previous: Vec<f64>,
-    #[reflect(ignore)]
     current: Vec<f64>,
-    #[reflect(ignore)]
     displayed: Vec<f64>,
     /// Ticks since the last push: 0 in the tick of the push.
     age: u8,
@@ -211,6 +211,14 @@ impl VisualState {
     /// Whether the state on screen is constant, because nothing was pushed for a tick.
     pub fn is_settled(&self) -> bool {
         self.shows_newest
+    }
+
+    /// Whether all of its states have this number of modal coordinates, and their poses a place.
+    pub(crate) fn fits(&self, modes: usize) -> bool {
+        let states = [&self.previous, &self.current, &self.displayed];
+        let poses = self.poses.iter().flatten();
+        states.iter().all(|q| q.len() == modes && q.iter().all(|x| x.is_finite()))
+            && poses.into_iter().all(|pose| pose.origin.is_finite() && pose.orientation.is_finite())
     }
 
     /// Removes the poses, so that the next pose is shown at once without interpolation.

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use bevy::{math::DVec3, prelude::*};
+use bevy::{ecs::entity::MapEntities, math::DVec3, prelude::*};
 use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused, BodyState, Driven};
 use pliant_modal as modal;
@@ -34,10 +34,11 @@ impl Default for BodyFriction {
 pub struct TouchBodies;
 
 /// A place where a body touches an obstacle or another body.
-#[derive(Reflect, Debug, Clone, Copy, PartialEq)]
+#[derive(Reflect, MapEntities, Debug, Clone, Copy, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct ContactPoint {
     /// The entity of the [`Obstacle`](crate::Obstacle) or of the other body.
+    #[entities]
     pub other: Entity,
     /// Surface vertex of the body at the center of the touching patch.
     pub vertex: u32,
@@ -56,7 +57,7 @@ pub struct ContactPoint {
 /// The contacts of a body in its last step. The plugin adds this component to every body.
 #[derive(Component, Reflect, Debug, Clone, PartialEq, Default)]
 #[reflect(Component, Default, Debug, Clone, PartialEq)]
-pub struct BodyContacts(pub Vec<ContactPoint>);
+pub struct BodyContacts(#[entities] pub Vec<ContactPoint>);
 
 impl BodyContacts {
     /// Sum of the forces on the body over the last step, N, world axes.
@@ -103,16 +104,18 @@ pub struct ContactEnded {
 }
 
 /// The obstacles that a body was given, at the indices that its solver knows.
-#[derive(Component, Debug, Default)]
+#[derive(Component, Reflect, Debug, Default)]
+#[reflect(Component, Default)]
 pub(crate) struct Nearby {
+    #[entities]
     slots: Vec<Option<Entity>>,
     /// BodyFriction that was refused, so that it is told once.
     refused: Option<f64>,
 }
 
-/// Adds what a new body needs for its contacts.
+/// Adds what a new body needs for its contacts. A loaded body has it already.
 pub(crate) fn prepare_body(added: On<Add, BodyState>, mut commands: Commands) {
-    commands.entity(added.entity).try_insert((Nearby::default(), BodyContacts::default()));
+    commands.entity(added.entity).try_insert_if_new((Nearby::default(), BodyContacts::default()));
 }
 
 /// Removes the contacts of a body that is removed, and wakes those that touched it.
@@ -147,7 +150,7 @@ type Bodies<'w, 's> = Query<
 /// Gives each body the obstacles near it. What has not changed is not touched, so that bodies rest.
 pub(crate) fn place_obstacles(
     time: Res<Time>,
-    mut refusals: MessageWriter<BodyRefused>,
+    mut commands: Commands,
     obstacles: Query<(Entity, &Motion, Option<Ref<ContactLayers>>)>,
     mut last: Local<Vec<Entity>>,
     mut bodies: Bodies,
@@ -210,7 +213,7 @@ pub(crate) fn place_obstacles(
                 None => Arc::new(Nothing),
             });
             if let Err(error) = state.body_mut().set_obstacles(list.collect()) {
-                refusals.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+                commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
             }
         }
         let wanted = friction.as_deref().copied().unwrap_or_default().0;
@@ -221,7 +224,7 @@ pub(crate) fn place_obstacles(
             nearby.refused = set.is_err().then_some(wanted);
             if let Err(error) = set {
                 warn!("{entity}: {error}");
-                refusals.write(BodyRefused { entity, error: BodyError::Friction(error) });
+                commands.trigger(BodyRefused { entity, error: BodyError::Friction(error) });
             }
         }
     }

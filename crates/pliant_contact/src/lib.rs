@@ -86,6 +86,9 @@ impl Plugin for ContactPlugin {
             .register_type::<TouchBodies>()
             .register_type::<BodyContacts>()
             .register_type::<ContactPoint>()
+            .register_type::<ContactStarted>()
+            .register_type::<ContactEnded>()
+            .register_type::<contacts::Nearby>()
             .add_observer(contacts::prepare_body)
             .add_observer(contacts::forget_body)
             .add_systems(

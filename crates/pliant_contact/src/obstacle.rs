@@ -23,11 +23,12 @@ use crate::mesh::{InWorldOf, Solid, Solids};
 /// An obstacle may move. Its velocity is its way since the last tick, so that it carries and pushes
 /// what it touches. Bodies do not push it back. A way faster than 100 m/s or 100 rad/s is a
 /// teleport without velocity.
-#[derive(Component, Reflect, Debug, Clone, PartialEq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[derive(Component, FromTemplate, Reflect, Debug, Default, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[require(Transform)]
 pub enum Obstacle {
-    /// Everything below the entity's origin, along its own y axis.
+    /// Everything below the entity's origin, along its own y axis. Default.
+    #[default]
     Floor,
     /// A ball around the entity's origin.
     Ball {
@@ -309,7 +310,6 @@ pub(crate) fn move_obstacles(
     #[cfg(feature = "mesh")] mut unsound: Local<BTreeSet<Entity>>,
     mut commands: Commands,
     transforms: TransformHelper,
-    mut refused: MessageWriter<BodyRefused>,
     mut obstacles: Query<(Entity, &Obstacle, Option<&mut Motion>)>,
     gone: Query<Entity, (With<Motion>, Without<Obstacle>)>,
 ) {
@@ -336,7 +336,7 @@ pub(crate) fn move_obstacles(
             Some(Err(error)) => {
                 if unsound.insert(entity) {
                     warn!("{entity}: {error}");
-                    refused.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+                    commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
                 }
                 None
             }
@@ -353,7 +353,7 @@ pub(crate) fn move_obstacles(
             now.sound = checked.is_ok();
             if let (Err(error), true) = (checked, before) {
                 warn!("{entity}: {error}");
-                refused.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+                commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
             }
         }
         match (motion, now) {

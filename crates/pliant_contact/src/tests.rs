@@ -44,8 +44,8 @@ fn app() -> App {
         .init_resource::<Told>()
         .add_observer(|event: On<ContactStarted>, mut told: ResMut<Told>| told.started.push(*event))
         .add_observer(|event: On<ContactEnded>, mut told: ResMut<Told>| told.ended.push(*event))
-        .add_systems(Last, |mut refused: MessageReader<BodyRefused>, mut told: ResMut<Told>| {
-            told.refused.extend(refused.read().map(|refused| refused.error.to_string()));
+        .add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
+            told.refused.push(refused.error.to_string());
         });
     app.update();
     app

@@ -39,7 +39,8 @@ pub const VISUAL_OFFSET: DiagnosticPath = DiagnosticPath::const_new("pliant/net/
 /// Counts start when the app starts and never fall: closed connections stay counted. A host adds up
 /// its guests, and a peer adds up the other peers. Both report the worst round trip and the mean
 /// loss.
-#[derive(Resource, Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Resource, Reflect, Debug, Clone, Copy, Default, PartialEq)]
+#[reflect(Resource, Debug, Default, Clone, PartialEq)]
 pub struct NetStats {
     /// Number of open connections.
     pub peers: usize,

@@ -14,10 +14,10 @@ use crate::host::{self, HostConfig, NetHost};
 use crate::metrics::{self, NetStats, RateMarks};
 use crate::peer::{self, NetPeer, PeerConfig};
 use crate::recording::{RecordingError, SessionRecording};
-use crate::remote;
+use crate::remote::{self, RemoteBody, RemoteHands};
 use crate::shared_body::SharedBody;
 use crate::transport::{Endpoint, Invite, TransportError};
-use crate::user::{UserJoined, UserLeft};
+use crate::user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself};
 
 /// Why a session could not be set up.
 #[derive(Debug, Error)]
@@ -132,6 +132,16 @@ impl Plugin for NetPlugin {
         app.init_resource::<NetStats>()
             .init_resource::<RateMarks>()
             .register_type::<SharedBody>()
+            .register_type::<RemoteBody>()
+            .register_type::<RemoteHands>()
+            .register_type::<User>()
+            .register_type::<Yourself>()
+            .register_type::<UserLink>()
+            .register_type::<HandOf>()
+            .register_type::<Hands>()
+            .register_type::<NetStats>()
+            .register_type::<UserJoined>()
+            .register_type::<UserLeft>()
             .add_message::<UserJoined>()
             .add_message::<UserLeft>()
             .add_systems(Last, measure);

@@ -2,16 +2,40 @@
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_stream::{BodyId, DisconnectReason, UserId};
+use bevy::reflect::reflect_remote;
+use pliant_stream::{BodyId, DisconnectReason, Role, UserId};
+
+// The protocol's types do not depend on an engine. Reflection accesses their fields through these.
+
+#[reflect_remote(BodyId)]
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
+pub(crate) struct ReflectedBodyId(pub u16);
+
+#[reflect_remote(UserId)]
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
+pub(crate) struct ReflectedUserId(pub u16);
+
+#[reflect_remote(Role)]
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
+pub(crate) enum ReflectedRole {
+    Hold,
+    Watch,
+}
 
 /// The session's body that this entity tracks.
-#[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RemoteBody(pub BodyId);
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
+pub struct RemoteBody(#[reflect(remote = ReflectedBodyId)] pub BodyId);
 
 /// Another user's hand on a body.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
 pub struct RemoteHand {
     /// The user whose hand this is.
+    #[reflect(remote = ReflectedUserId)]
     pub user: UserId,
     /// Surface vertex at the center of the patch.
     pub vertex: u32,
@@ -23,11 +47,13 @@ pub struct RemoteHand {
 
 /// The hands of the other users on a guest's body at the displayed tick. At most
 /// [`pliant_stream::MAX_GRABS`].
-#[derive(Component, Debug, Clone, Default, PartialEq)]
+#[derive(Component, Reflect, Debug, Clone, Default, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct RemoteHands(pub Vec<RemoteHand>);
 
 /// A body of the host has arrived.
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct BodyArrived {
     /// The entity of the body, with [`RemoteBody`], [`ModalBody`](pliant_body::ModalBody) and
     /// [`SharedBody`](crate::SharedBody).
@@ -38,7 +64,8 @@ pub struct BodyArrived {
 
 /// The host has removed a body from the session. An entity that the plugin spawned for the body is
 /// despawned. An entity of the app stays, in the state in which it was last displayed.
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct BodyLeft {
     /// The entity of the body.
     pub entity: Entity,
@@ -48,7 +75,8 @@ pub struct BodyLeft {
 
 /// The host has refused one of this app's grabs, or has taken it off the body. Despawn the grab, or
 /// change its vertex or radius to try again.
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct GrabRefused {
     /// The entity of the grab.
     pub entity: Entity,
@@ -57,14 +85,18 @@ pub struct GrabRefused {
 /// The guest has lost its connection to the host. Bodies keep their last displayed state, the
 /// entities of the other users are despawned, and the guest tries to join again
 /// ([`JoinConfig::rejoin`](crate::JoinConfig::rejoin)).
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct SessionLost {
     /// The reason.
     pub reason: DisconnectReason,
 }
 
 /// This app has joined the session, for the first time or again.
-#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Message, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct SessionJoined {
     /// The number of this app's user. It is the same as before if the host remembers this user's
     /// key.
@@ -74,14 +106,22 @@ pub struct SessionJoined {
 }
 
 /// The session is over.
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct SessionClosed {
     /// The reason.
     pub reason: DisconnectReason,
 }
 
 pub(crate) fn register(app: &mut App) {
-    app.add_message::<BodyArrived>()
+    app.register_type::<BodyArrived>()
+        .register_type::<BodyLeft>()
+        .register_type::<GrabRefused>()
+        .register_type::<SessionLost>()
+        .register_type::<SessionJoined>()
+        .register_type::<SessionClosed>()
+        .add_message::<BodyArrived>()
         .add_message::<BodyLeft>()
         .add_message::<GrabRefused>()
         .add_message::<SessionLost>()

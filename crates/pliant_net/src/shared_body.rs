@@ -8,8 +8,8 @@ use bevy::prelude::*;
 /// a guest, the app may put it on an entity for the body of this name. The body then arrives on
 /// that entity, which keeps its transform and its other components (a material, for example). If
 /// there is no such entity, the plugin spawns one at the host's transform.
-#[derive(Component, Debug, Clone, PartialEq, Eq, Reflect)]
-#[reflect(Component, Clone, PartialEq)]
+#[derive(Component, Reflect, Debug, Default, Clone, PartialEq, Eq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct SharedBody {
     /// Name of the body in the session, at most 64 bytes. Bodies of the same name are matched in
     /// the order in which they arrive.

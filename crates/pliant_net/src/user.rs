@@ -5,12 +5,15 @@ use std::time::Duration;
 use bevy::prelude::*;
 use pliant_stream::{DisconnectReason, UserId, UserLinkInfo};
 
+use crate::remote::{ReflectedRole, ReflectedUserId};
 use crate::transport::Role;
 
 /// A user of the session. Every app has one entity for each user, including its own ([`Yourself`]).
-#[derive(Component, Debug, Clone, PartialEq)]
+#[derive(Component, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Component, Debug, Clone, PartialEq)]
 pub struct User {
     /// The number that the host gave the user. The user at the host is [`UserId::HOST`].
+    #[reflect(remote = ReflectedUserId)]
     pub id: UserId,
     /// Name of the user, at most 64 bytes. The name comes from the network: display it, but do not
     /// trust it.
@@ -18,6 +21,7 @@ pub struct User {
     /// The user's color, the same in every app.
     pub color: Color,
     /// What the user may do.
+    #[reflect(remote = ReflectedRole)]
     pub role: Role,
 }
 
@@ -57,7 +61,8 @@ pub fn color_of(user: UserId) -> Color {
 }
 
 /// Marks the entity of this app's own user.
-#[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct Yourself;
 
 /// Quality of the link to a user.
@@ -65,7 +70,8 @@ pub struct Yourself;
 /// A host has it on every guest's entity. A guest has it on its own entity for the link to the
 /// host, and on the other guests' entities with the host's values, which arrive about once a
 /// second. A peer has it on every other peer's entity.
-#[derive(Component, Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Default)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct UserLink {
     /// Smoothed round trip. Zero before the first measurement.
     pub round_trip: Duration,
@@ -77,17 +83,21 @@ pub struct UserLink {
 
 /// The user whose hand a [`Grab`](pliant_body::Grab) is. Despawning the entity on a host ends a
 /// guest's grab, and the guest receives [`GrabRefused`](crate::GrabRefused).
-#[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Debug, Clone, PartialEq)]
 #[relationship(relationship_target = Hands)]
 pub struct HandOf(#[entities] pub Entity);
 
 /// The grabs of a user, oldest first. They are despawned with the user.
-#[derive(Component, Debug, Default)]
+#[derive(Component, Reflect, Debug, Default)]
+#[reflect(Component, Debug, Default)]
 #[relationship_target(relationship = HandOf, linked_spawn)]
 pub struct Hands(Vec<Entity>);
 
 /// A user has joined.
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct UserJoined {
     /// The user's entity, with [`User`].
     pub entity: Entity,
@@ -100,7 +110,9 @@ pub struct UserJoined {
 }
 
 /// A user has left. The entity is despawned.
-#[derive(Message, Debug, Clone, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct UserLeft {
     /// The number that the user had.
     pub id: UserId,

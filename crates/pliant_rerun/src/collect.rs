@@ -226,6 +226,11 @@ type Bodies<'w, 's> = Query<
     ),
 >;
 
+/// Logs the refused inputs as lines.
+pub(crate) fn note_refusal(refused: On<BodyRefused>, mut own: ResMut<RerunScalars>) {
+    own.warn(format!("{}: {}", refused.entity, refused.error));
+}
+
 #[expect(
     clippy::too_many_arguments,
     reason = "a reader of everything; each argument is one thing that is read"
@@ -239,7 +244,6 @@ pub(crate) fn collect(
     tick: Res<PliantTick>,
     time: Res<Time>,
     diagnostics: Option<Res<DiagnosticsStore>>,
-    mut refused: MessageReader<BodyRefused>,
     logged: Option<Res<LogLines>>,
     session: Res<Hands>,
     bodies: Bodies,
@@ -247,9 +251,6 @@ pub(crate) fn collect(
 ) {
     let collector = &mut *collector;
     let wanted = *wanted;
-    for refused in refused.read() {
-        own.warn(format!("{}: {}", refused.entity, refused.error));
-    }
     if collector.workers.iter().all(Worker::is_full) && collector.workers.iter().any(Worker::listens) {
         // `decide` has counted this tick. The lines wait for a later frame.
         return;

@@ -291,6 +291,7 @@ impl Plugin for RerunPlugin {
             .register_type::<RerunRecording>()
             .init_resource::<collect::Hands>()
             .init_resource::<collect::WantedData>()
+            .add_observer(collect::note_refusal)
             .add_systems(
                 self.schedule,
                 (

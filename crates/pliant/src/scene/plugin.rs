@@ -145,13 +145,11 @@ impl Plugin for SceneFilePlugin {
             .init_asset::<SceneFile>()
             .init_asset_loader::<SceneFileLoader>()
             .add_message::<SceneFailed>()
-            .add_systems(
-                PostUpdate,
-                (spawn::watch, spawn::watch_settings, spawn::make).chain().after(TransformSystems::Propagate),
-            )
+            .add_systems(PostUpdate, (spawn::watch, spawn::make).chain().after(TransformSystems::Propagate))
+            .add_observer(spawn::watch_settings)
             .add_systems(self.schedule, (spawn::begin, hands::play).chain().before(PliantSystems::Input));
         #[cfg(feature = "bake")]
-        app.add_systems(PostUpdate, spawn::watch_bakes);
+        app.add_observer(spawn::watch_bakes);
         let Some(file) = &self.file else {
             self.build_devices(app);
             return;

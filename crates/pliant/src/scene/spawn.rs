@@ -176,42 +176,40 @@ pub(super) fn watch(
 
 /// Reports bodies whose settings are refused.
 pub(super) fn watch_settings(
+    refused: On<BodyRefused>,
     mut commands: Commands,
-    mut refused: MessageReader<BodyRefused>,
     bodies: Query<(&PartOf, &Name, &SceneSource), (With<SceneBody>, Without<BodyState>)>,
+    lost: Query<(Entity, &PartOf, &SceneSource), With<Lost>>,
 ) {
-    let mut reported = Vec::new();
-    for refused in refused.read() {
-        let Ok((part, name, source)) = bodies.get(refused.entity) else { continue };
-        commands.entity(refused.entity).try_insert(Lost);
-        // One report covers all copies.
-        if reported.contains(&(part.0, &source.path)) {
-            continue;
-        }
-        reported.push((part.0, &source.path));
-        let message = format!("the body `{name}` cannot be made: {}", refused.error);
-        let error = source.file.error(&source.path, SceneErrorKind::Value, message);
-        let instance = part.0;
-        commands.queue(move |world: &mut World| fail(world, instance, error));
+    let Ok((part, name, source)) = bodies.get(refused.entity) else { return };
+    commands.entity(refused.entity).try_insert(Lost);
+    // One report covers all copies.
+    let is_copy = |(entity, of, from): (Entity, &PartOf, &SceneSource)| {
+        entity != refused.entity && of.0 == part.0 && from.path == source.path
+    };
+    if lost.iter().any(is_copy) {
+        return;
     }
+    let message = format!("the body `{name}` cannot be made: {}", refused.error);
+    let error = source.file.error(&source.path, SceneErrorKind::Value, message);
+    let instance = part.0;
+    commands.queue(move |world: &mut World| fail(world, instance, error));
 }
 
 /// Reports bodies that fail to bake.
 #[cfg(feature = "bake")]
 pub(super) fn watch_bakes(
+    failed: On<crate::body::BakeFailed>,
     mut commands: Commands,
-    mut failures: Option<MessageReader<crate::body::BakeFailed>>,
     bodies: Query<(&PartOf, &Name, &SceneSource), With<SceneBody>>,
 ) {
-    for failed in failures.iter_mut().flat_map(|failures| failures.read()) {
-        let Ok((part, name, source)) = bodies.get(failed.entity) else { continue };
-        let message = format!("the body `{name}` cannot be made: {}", failed.error);
-        let path = [source.path.as_slice(), &[Field("bake"), Field("shape")]].concat();
-        let error = source.file.error(&path, SceneErrorKind::Asset, message);
-        let instance = part.0;
-        commands.entity(failed.entity).try_insert(Lost);
-        commands.queue(move |world: &mut World| fail(world, instance, error));
-    }
+    let Ok((part, name, source)) = bodies.get(failed.entity) else { return };
+    let message = format!("the body `{name}` cannot be made: {}", failed.error);
+    let path = [source.path.as_slice(), &[Field("bake"), Field("shape")]].concat();
+    let error = source.file.error(&path, SceneErrorKind::Asset, message);
+    let instance = part.0;
+    commands.entity(failed.entity).try_insert(Lost);
+    commands.queue(move |world: &mut World| fail(world, instance, error));
 }
 
 /// Starts the clocks of the scripts once every body of the scene exists or has failed.
@@ -326,7 +324,7 @@ fn can_be_made(
         return Err(None);
     }
     #[cfg(feature = "bake")]
-    if !world.contains_resource::<Messages<crate::body::BakeFailed>>() {
+    if !world.contains_resource::<crate::body::Bakery>() {
         let message = format!("the body `{}` is to be baked, and this app has no `BakePlugin`", body.name);
         let path = [Field("bodies"), Item(entry), Field("bake")];
         return Err(Some(file.error(&path, SceneErrorKind::Feature, message)));

@@ -46,16 +46,15 @@ impl Plugin for BakePlugin {
             .register_type::<BakeFailed>()
             .register_type::<BakeProgress>()
             .register_type::<BakeStage>()
-            .add_message::<BakeFailed>()
             .insert_resource(Bakery { cache: self.cache.clone(), waiting: VecDeque::new(), running: None })
             .add_observer(forget)
             .add_systems(PreUpdate, (take_orders, work).chain());
     }
 }
 
-/// The running bake and the waiting requests.
+/// The running bake and the waiting requests. An app has it where it has the [`BakePlugin`].
 #[derive(Resource)]
-struct Bakery {
+pub struct Bakery {
     cache: Option<BakeCache>,
     waiting: VecDeque<Entity>,
     running: Option<BakeJob>,
@@ -100,7 +99,6 @@ fn work(
     mut bakery: ResMut<Bakery>,
     mut models: ResMut<Assets<ModalAsset>>,
     (meshes, server): (Option<Res<Assets<Mesh>>>, Option<Res<AssetServer>>),
-    mut failures: MessageWriter<BakeFailed>,
     mut requests: Query<(NameOrEntity, &BakeRequest, &mut BakeProgress, Option<&mut ModalBody>)>,
 ) {
     // In nearly every frame of a game no bake waits and none runs.
@@ -137,7 +135,7 @@ fn work(
                         Outcome::Failed(error) => {
                             error!("{name}: {error}");
                             *progress = BakeProgress::Failed { reason: error.to_string() };
-                            failures.write(BakeFailed { entity: name.entity, error });
+                            commands.trigger(BakeFailed { entity: name.entity, error });
                         }
                         Outcome::Cancelled => {}
                     }
@@ -161,7 +159,7 @@ fn work(
             Err(error) => {
                 error!("{name}: {error}");
                 *progress = BakeProgress::Failed { reason: error.to_string() };
-                failures.write(BakeFailed { entity, error });
+                commands.trigger(BakeFailed { entity, error });
             }
         }
     }

@@ -22,9 +22,11 @@ use thiserror::Error;
 /// The [`ModalBody`](crate::ModalBody) on the same entity may have any settings. The bake writes
 /// its model when the model is ready, and adds a `ModalBody` if there is none. A new model replaces
 /// an old one like any change of the handle: the body begins at rest, and grabs stay.
+///
+/// A world that is saved by reflection does not have its requests, which may hold code.
 #[derive(Component, Reflect, Debug, Clone)]
 #[reflect(opaque)]
-#[reflect(Component, Debug, Clone, from_reflect = false)]
+#[reflect(Debug, Clone)]
 #[require(BakeProgress)]
 pub struct BakeRequest {
     /// The shape that is filled with tetrahedra.
@@ -196,12 +198,12 @@ pub enum BakeBodyError {
     Threads(String),
 }
 
-/// Reports a [`BakeRequest`] that gave no model.
+/// Reports a [`BakeRequest`] that gave no model. Observe it on the entity or on all.
 ///
-/// The plugin writes this message and logs it with the entity's name. The entity keeps its previous
+/// The plugin triggers this event and logs it with the entity's name. The entity keeps its previous
 /// body.
-#[derive(Message, Reflect, Debug)]
-#[reflect(from_reflect = false)]
+#[derive(EntityEvent, Reflect, Debug)]
+#[reflect(Debug, from_reflect = false)]
 pub struct BakeFailed {
     /// The entity of the request.
     pub entity: Entity,

@@ -11,7 +11,7 @@ mod drawing;
 mod gpu;
 mod topology;
 
-use std::{sync::Arc, time::Instant};
+use std::sync::Arc;
 
 use bevy::{
     asset::{AssetEventSystems, RenderAssetUsages},
@@ -21,6 +21,7 @@ use bevy::{
     },
     diagnostic::Diagnostics,
     mesh::{Indices, PrimitiveTopology},
+    platform::time::Instant,
     prelude::*,
 };
 use pliant_modal::{HeldShapes, ModalModel};

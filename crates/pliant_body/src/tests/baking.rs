@@ -10,7 +10,7 @@ use bevy::{
 use pliant_bake::{BakeCache, BakeConfig};
 use pliant_mesh::shapes;
 
-use super::{app, model, state, tick};
+use super::{Told, app, model, refusals, state, tick};
 use crate::{
     ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeSkin,
     BodyState, ModalAsset, ModalBody,
@@ -40,15 +40,9 @@ fn progress(app: &App, entity: Entity) -> BakeProgress {
 
 /// Runs frames until the bake of `entity` is over, and returns the progress in each frame.
 fn wait(app: &mut App, entity: Entity) -> Vec<BakeProgress> {
-    wait_with(app, entity, |_| ())
-}
-
-/// Does the same as [`wait`], and calls `look` with the app after each frame.
-fn wait_with(app: &mut App, entity: Entity, mut look: impl FnMut(&App)) -> Vec<BakeProgress> {
     let (start, mut seen) = (Instant::now(), Vec::new());
     loop {
         app.update();
-        look(app);
         let now = progress(app, entity);
         let over = matches!(now, BakeProgress::Done { .. } | BakeProgress::Failed { .. });
         seen.push(now);
@@ -119,12 +113,11 @@ fn what_cannot_be_baked_says_why_and_the_next_one_is_made() {
     let nan = app.world_mut().spawn(nan).id();
     let bare = app.world_mut().spawn(BakeRequest { skin: BakeSkin::Shape, ..bar(5) }).id();
     let good = app.world_mut().spawn(bar(5)).id();
-    let mut cursor = app.world().resource::<Messages<BakeFailed>>().get_cursor();
-    let mut told = Vec::new();
-    let seen = wait_with(&mut app, good, |app| {
-        let messages = app.world().resource::<Messages<BakeFailed>>();
-        told.extend(cursor.read(messages).map(|failed| (failed.entity, failed.error.to_string())));
+    app.add_observer(|failed: On<BakeFailed>, mut told: ResMut<Told>| {
+        told.0.push((failed.entity, failed.error.to_string()));
     });
+    let seen = wait(&mut app, good);
+    let told = refusals(&mut app);
     assert!(matches!(seen.last(), Some(BakeProgress::Done { .. })), "{seen:?}");
     assert_eq!(told.iter().map(|(entity, _)| *entity).collect::<Vec<_>>(), [missing, nan, bare], "{told:?}");
     for ((entity, text), expected) in told.iter().zip(["jelly.obj", "Young's modulus", "expected a surface"])

@@ -1,7 +1,9 @@
 use bevy::{math::DVec3, prelude::*};
 
 use super::{app, model, refusals, spawn, spawn_with, state, steps};
-use crate::{BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset, ModalBody};
+use crate::{
+    BodyReady, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed, Grabs, ModalAsset, ModalBody, Released,
+};
 
 fn linear(body: &mut ModalBody) {
     body.settings.warp = false;
@@ -277,4 +279,43 @@ fn a_hand_that_lost_its_body_feels_nothing() {
         lose(app.world_mut(), body, hand);
         assert_eq!(force(&app, hand), GrabForce::default());
     }
+}
+
+#[derive(Resource, Default, Debug, PartialEq)]
+struct Seen(Vec<(&'static str, Entity, Option<Entity>)>);
+
+#[test]
+fn observers_are_told_of_bodies_and_of_hands_that_take_hold_and_let_go() {
+    let mut app = app();
+    app.init_resource::<Seen>()
+        .add_observer(|on: On<BodyReady>, mut seen: ResMut<Seen>| seen.0.push(("ready", on.entity, None)))
+        .add_observer(|on: On<Grabbed>, mut seen: ResMut<Seen>| {
+            seen.0.push(("grabbed", on.entity, Some(on.grab)));
+        })
+        .add_observer(|on: On<Released>, mut seen: ResMut<Seen>| {
+            seen.0.push(("released", on.entity, Some(on.grab)));
+        });
+    let seen = |app: &mut App| std::mem::take(&mut app.world_mut().resource_mut::<Seen>().0);
+    let body = spawn(&mut app, model::bar(), ());
+    assert_eq!(seen(&mut app), [("ready", body, None)]);
+    let [first, second] = [0, 1].map(|_| grab(&mut app, body, DVec3::X));
+    steps(&mut app, 3);
+    let both = [("grabbed", body, Some(first)), ("grabbed", body, Some(second))];
+    assert_eq!(seen(&mut app), both, "once each");
+    // A hand whose settings change holds on, and one that is refused lets go.
+    app.world_mut().get_mut::<Grab>(first).unwrap().stiffness = Some(50.0);
+    steps(&mut app, 2);
+    assert_eq!(seen(&mut app), []);
+    app.world_mut().get_mut::<Grab>(first).unwrap().stiffness = Some(-1.0);
+    steps(&mut app, 2);
+    assert_eq!(seen(&mut app), [("released", body, Some(first))]);
+    app.world_mut().entity_mut(second).remove::<GrabOf>();
+    steps(&mut app, 2);
+    assert_eq!(seen(&mut app), [("released", body, Some(second))]);
+    app.world_mut().entity_mut(second).insert(GrabOf(body));
+    steps(&mut app, 2);
+    assert_eq!(seen(&mut app), [("grabbed", body, Some(second))]);
+    app.world_mut().entity_mut(body).remove::<ModalBody>();
+    app.update();
+    assert_eq!(seen(&mut app), [("released", body, Some(second))]);
 }

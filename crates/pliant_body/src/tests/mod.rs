@@ -40,8 +40,8 @@ pub fn app_in(schedule: impl ScheduleLabel) -> App {
         .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
         .add_plugins((PliantBodyPlugin::new(schedule.intern()), RidingPlugin::new(schedule)))
         .init_resource::<Told>()
-        .add_systems(Last, |mut refused: MessageReader<BodyRefused>, mut told: ResMut<Told>| {
-            told.0.extend(refused.read().map(|refused| (refused.entity, refused.error.to_string())));
+        .add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
+            told.0.push((refused.entity, refused.error.to_string()));
         });
     app.update();
     app

@@ -11,6 +11,7 @@ use crate::{
 
 /// Identifies a device among the [`HapticDevices`]. An identifier is never used twice.
 #[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[reflect(Debug, Clone, PartialEq, Hash)]
 pub struct DeviceId(u32);
 
 /// The haptic devices in use. Each device runs its loop on its own thread until the app removes the
@@ -53,7 +54,8 @@ pub(crate) struct Entry {
 }
 
 /// A button of a device went down or came up.
-#[derive(Message, Debug, Clone, Copy, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct HapticButton {
     /// The device.
     pub device: DeviceId,
@@ -65,7 +67,9 @@ pub struct HapticButton {
 
 /// A fault of a device began or ended. The force fades, and it comes back by itself after the end
 /// of the fault.
-#[derive(Message, Debug, Clone, Copy, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct HapticFault {
     /// The device.
     pub device: DeviceId,
@@ -74,7 +78,9 @@ pub struct HapticFault {
 }
 
 /// A device was lost, came back or needs manual calibration.
-#[derive(Message, Debug, Clone, Copy, PartialEq)]
+#[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone, PartialEq)]
 pub struct HapticNotice {
     /// The device.
     pub device: DeviceId,

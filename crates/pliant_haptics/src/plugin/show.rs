@@ -1,7 +1,7 @@
 //! Drawing of the force on screen, for players without force feedback and for spectators.
 
 use bevy::{math::DVec3, prelude::*};
-use pliant_body::{Grab, GrabForce};
+use pliant_body::{Grab, GrabForce, PliantGizmos};
 
 use super::{HapticTool, ToolGrabs, ToolPose};
 
@@ -43,7 +43,7 @@ impl ForceArrow {
 }
 
 pub(crate) fn draw(
-    mut gizmos: Gizmos,
+    mut gizmos: Gizmos<PliantGizmos>,
     tools: Query<(&ToolPose, &GlobalTransform, &ForceArrow, Option<&ToolGrabs>), With<HapticTool>>,
     grabs: Query<&GrabForce, With<Grab>>,
 ) {

@@ -2,9 +2,12 @@
 
 use std::time::Duration;
 
+use bevy::prelude::*;
+
 /// Counts of datagrams that this end dropped, by reason. They do not include packets that the
 /// network lost ([`PeerStats::lost_packets`]).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Reflect, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct DropCounts {
     /// To the peer: the queue was full (because of the rate cap, or a link slower than the
