@@ -8,7 +8,7 @@
 //! - Ctrl-C shuts the server down cleanly, and so does the SIGTERM of a service manager.
 //!
 //! ```sh
-//! cargo run --release -p pliant --no-default-features --features net --example dedicated_server -- --key server.key
+//! cargo run --release -p pliant_examples --no-default-features --features net --example dedicated_server -- --key server.key
 //! ```
 
 mod session;

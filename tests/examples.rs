@@ -3,8 +3,8 @@
 //! Each file names an example, its arguments, and what the example must print and write.
 //!
 //! ```sh
-//! cargo test -p pliant                      # builds the examples first, as any `cargo test` of the package does
-//! PLIANT_RUN=join cargo test -p pliant      # those whose file's name begins like that
+//! cargo test -p pliant_examples              # builds the examples first, as any `cargo test` of the package does
+//! PLIANT_RUN=join cargo test -p pliant_examples      # those whose file's name begins like that
 //! ```
 //!
 //! Each example runs in its own folder, without a display and with its own cache.

@@ -11,17 +11,22 @@ use bevy::{
     transform::TransformPlugin,
     world_serialization::serde::WorldDeserializer,
 };
-use pliant::{modal::State, prelude::*};
+use pliant::{
+    bake::{BakeConfig, Material, bake},
+    mesh::shapes,
+    modal::{Elasticity, State},
+    prelude::*,
+};
 use serde::de::DeserializeSeed;
 
 const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
 
 /// Returns an app whose every frame is one step, unless time is paused.
-fn app() -> App {
+fn app(assets: &str) -> App {
     let mut app = App::new();
     app.add_plugins((
         MinimalPlugins,
-        AssetPlugin { file_path: ASSETS.into(), ..default() },
+        AssetPlugin { file_path: assets.into(), ..default() },
         TransformPlugin,
         PliantPlugins::default(),
     ))
@@ -29,7 +34,8 @@ fn app() -> App {
     .insert_resource(TimeUpdateStrategy::FixedTimesteps(1));
     app.finish();
     app.cleanup();
-    app.update();
+    // Time begins in the second frame.
+    (0..2).for_each(|_| app.update());
     app
 }
 
@@ -52,18 +58,18 @@ fn wait_for_bodies(app: &mut App, count: usize) {
     pause(app, false);
 }
 
-/// Names the entity, so that it is found again in the loaded world.
+/// Finds an entity by its name, which it also has in the loaded world.
 fn named(app: &mut App, name: &str) -> Entity {
     let world = app.world_mut();
     let mut names = world.query::<(Entity, &Name)>();
     names.iter(world).find(|(_, of)| of.as_str() == name).map(|(entity, _)| entity).unwrap()
 }
 
-fn spawn(app: &mut App, name: &str, model: &str, at: Vec3, settings: fn(&mut ModalBody)) -> Entity {
+fn spawn(app: &mut App, name: &str, model: &str, at: Vec3, settings: fn(&mut ModalBody)) {
     let mut body = ModalBody::new(app.world().resource::<AssetServer>().load(model.to_owned()));
     body.settings.gravity = [0.0, -9.81, 0.0];
     settings(&mut body);
-    app.world_mut().spawn((Name::new(name.to_owned()), body, Transform::from_translation(at))).id()
+    app.world_mut().spawn((Name::new(name.to_owned()), body, Transform::from_translation(at)));
 }
 
 /// Spawns a hand at the vertex of the body that is farthest along `toward`.
@@ -72,34 +78,16 @@ fn hold(app: &mut App, name: &str, body: &str, toward: Vec3) {
     let state = app.world().get::<BodyState>(body).unwrap();
     let positions = state.model().surface().positions();
     let along = |vertex: usize| Vec3::from(positions[vertex]).dot(toward);
-    let vertex = (0..positions.len()).max_by(|a, b| along(*a).total_cmp(&along(*b))).unwrap() as u32;
+    let vertex = (0..positions.len()).max_by(|a, b| along(*a).total_cmp(&along(*b))).unwrap();
     let place = app.world().get::<Transform>(body).unwrap().translation;
-    let at = (place + Vec3::from(positions[vertex as usize])).as_dvec3();
-    let radius = 0.06 * state.model().size();
-    app.world_mut().spawn((Name::new(name.to_owned()), Grab::new(vertex, radius, at), GrabOf(body)));
+    let at = (place + Vec3::from(positions[vertex])).as_dvec3();
+    let grab = Grab::new(vertex as u32, 0.06 * state.model().size(), at);
+    app.world_mut().spawn((Name::new(name.to_owned()), grab, GrabOf(body)));
 }
 
-const BODIES: [&str; 3] = ["anchored", "creeping", "free"];
-const HANDS: [&str; 3] = ["left", "right", "throwing"];
-
-/// A scene with anchored, viscoelastic and free bodies, and hands on all of them.
-fn scene() -> App {
-    let mut app = app();
-    spawn(&mut app, "anchored", "pip.modal", Vec3::ZERO, |_| ());
-    spawn(&mut app, "creeping", "bud.modal", Vec3::X, |body| {
-        body.settings.relaxation = Some(Relaxation { ratio: 0.5, time: 0.3 });
-    });
-    spawn(&mut app, "free", "jack.modal", Vec3::new(3.0, 1.0, 0.0), |_| ());
-    wait_for_bodies(&mut app, BODIES.len());
-    hold(&mut app, "left", "anchored", Vec3::NEG_X);
-    hold(&mut app, "right", "creeping", Vec3::Y);
-    hold(&mut app, "throwing", "free", Vec3::Z);
-    app
-}
-
-/// Moves the hands as they are at this tick, and steps once.
-fn step(app: &mut App, tick: u32) {
-    for (k, name) in HANDS.into_iter().enumerate() {
+/// Moves the hands as they move at this tick, and steps once.
+fn step(app: &mut App, hands: &[&str], tick: u32) {
+    for (k, name) in hands.iter().enumerate() {
         let hand = named(app, name);
         let phase = 0.07 * f64::from(tick) + k as f64;
         let way = 1e-3 * DVec3::new(phase.sin(), 0.7 * (1.3 * phase).cos(), (0.6 * phase).sin());
@@ -109,12 +97,12 @@ fn step(app: &mut App, tick: u32) {
 }
 
 /// State of every body, and force on every hand.
-fn results(app: &mut App) -> (Vec<State>, Vec<GrabForce>) {
-    let bodies = BODIES.map(|name| named(app, name));
-    let hands = HANDS.map(|name| named(app, name));
+fn results(app: &mut App, bodies: &[&str], hands: &[&str]) -> (Vec<State>, Vec<GrabForce>) {
+    let bodies: Vec<Entity> = bodies.iter().map(|name| named(app, name)).collect();
+    let hands: Vec<Entity> = hands.iter().map(|name| named(app, name)).collect();
     let state = |body| app.world().get::<BodyState>(body).unwrap().body().state().clone();
     let force = |hand| *app.world().get::<GrabForce>(hand).unwrap();
-    (bodies.map(state).into(), hands.map(force).into())
+    (bodies.into_iter().map(state).collect(), hands.into_iter().map(force).collect())
 }
 
 /// Saves all entities of a world and the number of the tick, as text.
@@ -133,8 +121,8 @@ fn save(app: &App) -> String {
 }
 
 /// Writes a saved world to a new one.
-fn load(text: &str) -> App {
-    let mut app = app();
+fn load(text: &str, assets: &str) -> App {
+    let mut app = app(assets);
     let server = app.world().resource::<AssetServer>().clone();
     let registry = app.world().resource::<AppTypeRegistry>().clone();
     let mut from = ron::de::Deserializer::from_str(text).unwrap();
@@ -144,23 +132,103 @@ fn load(text: &str) -> App {
     app
 }
 
-#[test]
-fn a_saved_and_loaded_scene_goes_on_bit_for_bit() {
-    let mut scene = scene();
-    (0..97).for_each(|tick| step(&mut scene, tick));
-    let text = save(&scene);
-    let mut loaded = load(&text);
-    wait_for_bodies(&mut loaded, BODIES.len());
-    assert_eq!(results(&mut loaded).0, results(&mut scene).0, "the states that were saved");
+/// Runs a scene on, saves it, loads it, and runs both on for 600 ticks.
+fn check(scene: &mut App, assets: &str, bodies: &[&str], hands: &[&str]) -> App {
+    (0..97).for_each(|tick| step(scene, hands, tick));
+    let mut loaded = load(&save(scene), assets);
+    wait_for_bodies(&mut loaded, bodies.len());
+    let states = |app: &mut App| results(app, bodies, hands).0;
+    assert_eq!(states(&mut loaded), states(scene), "the states that were saved");
     for tick in 97..697 {
-        step(&mut scene, tick);
-        step(&mut loaded, tick);
-        assert_eq!(results(&mut loaded), results(&mut scene), "tick {tick}");
+        step(scene, hands, tick);
+        step(&mut loaded, hands, tick);
+        assert_eq!(results(&mut loaded, bodies, hands), results(scene, bodies, hands), "tick {tick}");
     }
     let tick = |app: &App| *app.world().resource::<PliantTick>();
-    assert_eq!(tick(&loaded), tick(&scene));
-    // Something has moved.
-    let (states, forces) = results(&mut scene);
-    assert!(states.iter().all(|state| state.v.iter().any(|v| v.abs() > 1e-4)));
-    assert!(forces.iter().all(|force| force.force.length() > 1e-2));
+    assert_eq!(tick(&loaded), tick(scene));
+    // The hands feel something.
+    assert!(results(scene, bodies, hands).1.iter().all(|force| force.force.length() > 1e-2));
+    loaded
+}
+
+/// Anchored, viscoelastic and free bodies with hands on them, and a floor onto which a fourth body
+/// falls.
+#[test]
+fn a_saved_and_loaded_scene_goes_on_bit_for_bit() {
+    let bodies = ["anchored", "creeping", "free", "fallen"];
+    let mut scene = app(ASSETS);
+    spawn(&mut scene, "anchored", "pip.modal", Vec3::ZERO, |_| ());
+    spawn(&mut scene, "creeping", "bud.modal", Vec3::X, |body| {
+        body.settings.relaxation = Some(Relaxation { ratio: 0.5, time: 0.3 });
+    });
+    spawn(&mut scene, "free", "jack.modal", Vec3::new(3.0, 1.0, 0.0), |_| ());
+    spawn(&mut scene, "fallen", "jack.modal", Vec3::new(6.0, 0.3, 0.0), |_| ());
+    scene.world_mut().spawn((Name::new("floor"), Obstacle::Floor));
+    wait_for_bodies(&mut scene, bodies.len());
+    hold(&mut scene, "left", "anchored", Vec3::NEG_X);
+    hold(&mut scene, "right", "creeping", Vec3::Y);
+    hold(&mut scene, "throwing", "free", Vec3::Z);
+    let mut loaded = check(&mut scene, ASSETS, &bodies, &["left", "right", "throwing"]);
+    let touches = |app: &mut App| {
+        let (body, floor) = (named(app, "fallen"), named(app, "floor"));
+        app.world().get::<BodyContacts>(body).unwrap().touches(floor)
+    };
+    assert!(touches(&mut scene) && touches(&mut loaded), "the fallen body lies on the floor");
+}
+
+#[test]
+fn a_body_waits_for_the_shapes_of_its_hands_and_goes_on_bit_for_bit() {
+    let config = BakeConfig {
+        modes: 20,
+        material: Some(Material::NeoHookean),
+        anchors: vec!["x<1e-9".parse().unwrap()],
+        ..Default::default()
+    };
+    let mesh = shapes::bar([10, 2, 2], [1.0, 0.1, 0.1]).unwrap();
+    let model = bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model;
+    let folder = std::env::temp_dir().join(format!("pliant-saving-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    model.write(folder.join("bar.modal")).unwrap();
+    let assets = folder.to_str().unwrap();
+    let mut scene = app(assets);
+    spawn(&mut scene, "bar", "bar.modal", Vec3::ZERO, |body| {
+        body.settings.elasticity = Elasticity::Reduced;
+        body.rest_speed = 0.0;
+    });
+    wait_for_bodies(&mut scene, 1);
+    hold(&mut scene, "hand", "bar", Vec3::X);
+    let shapes = |app: &mut App| {
+        let body = named(app, "bar");
+        app.world().get::<BodyState>(body).unwrap().body().held_shapes().is_some()
+    };
+    let begun = Instant::now();
+    while !shapes(&mut scene) {
+        assert!(begun.elapsed() < Duration::from_secs(300), "no shapes are made");
+        std::thread::sleep(Duration::from_millis(2));
+        scene.update();
+    }
+    let mut loaded = check(&mut scene, assets, &["bar"], &["hand"]);
+    assert!(shapes(&mut loaded), "the loaded body has the shapes, too");
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[derive(Resource, Default)]
+struct Told(Vec<String>);
+
+#[test]
+fn a_state_of_another_model_is_refused_and_the_body_begins_at_rest() {
+    let mut scene = app(ASSETS);
+    spawn(&mut scene, "pip", "pip.modal", Vec3::ZERO, |_| ());
+    wait_for_bodies(&mut scene, 1);
+    (0..30).for_each(|_| scene.update());
+    let mut loaded = load(&save(&scene).replace("pip.modal", "bud.modal"), ASSETS);
+    loaded.init_resource::<Told>().add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
+        told.0.push(refused.error.to_string());
+    });
+    wait_for_bodies(&mut loaded, 1);
+    let told = &loaded.world().resource::<Told>().0;
+    assert!(matches!(&told[..], [one] if one.contains("saved state")), "{told:?}");
+    let body = named(&mut loaded, "pip");
+    assert!(loaded.world().get::<BodyState>(body).unwrap().body().q().iter().all(|q| *q == 0.0));
+    (0..30).for_each(|_| loaded.update());
 }

@@ -16,7 +16,7 @@ hours=1
 [ "${1:-}" = --hours ] && hours=${2:?how many hours}
 seconds=$(awk "BEGIN { print int(3600 * $hours) }")
 if [ -z "${BIN:-}" ]; then
-    cargo build --release -p pliant --no-default-features --features net \
+    cargo build --release -p pliant_examples --no-default-features --features net \
         --example dedicated_server --example join || exit 2
     BIN=$(cargo metadata --format-version 1 --no-deps |
         sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release/examples

@@ -13,7 +13,7 @@ skip() { echo "skipped: $1"; exit 77; }
 [ -r /proc/loadavg ] || skip "needs Linux"
 env --default-signal=INT true 2>/dev/null || skip "no env of GNU coreutils"
 if [ -z "${BIN:-}" ]; then
-    cargo build --release -p pliant --no-default-features --features net \
+    cargo build --release -p pliant_examples --no-default-features --features net \
         --example dedicated_server --example join || exit 2
     BIN=$(cargo metadata --format-version 1 --no-deps |
         sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release/examples

@@ -5,7 +5,7 @@
 //! hand:
 //!
 //! ```sh
-//! cargo run --release -p pliant --no-default-features --features window --example leave_out -- --scene solo
+//! cargo run --release -p pliant_examples --no-default-features --features window --example leave_out -- --scene solo
 //! ```
 //!
 //! The program uses no window and no graphics card. Surfaces are written on the CPU, to an image

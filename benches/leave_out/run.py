@@ -29,12 +29,12 @@ def cargo(*arguments):
 
 def crates(features):
     """Packages that a game with these features compiles, this project's own among them."""
-    tree = cargo("tree", "-p", "pliant", "--no-default-features", "--features", ",".join(features), "-e", "normal,build", "--prefix", "none", "-f", "{p}")
+    tree = cargo("tree", "-p", "pliant_examples", "--no-default-features", "--features", ",".join(features), "-e", "normal,build", "--prefix", "none", "-f", "{p}")
     return len({line.removesuffix(" (*)") for line in tree.splitlines() if line})
 
 
 def build(features, one_engine, target):
-    chosen, wanted = ["-p", "pliant"], [f"pliant/{feature}" for feature in features]
+    chosen, wanted = ["-p", "pliant_examples"], [f"pliant_examples/{feature}" for feature in features]
     # Without a renderer the engine is another one altogether.
     if one_engine and "window" in features:
         chosen += [argument for crate in OURS for argument in ("-p", crate)]

@@ -26,7 +26,7 @@ long=${2:-60}
 users=${*:-1 16 64 128 256}
 cd "$(dirname "$0")/../.."
 if [ -z "${BIN:-}" ]; then
-    cargo build --release -p pliant --no-default-features --features net \
+    cargo build --release -p pliant_examples --no-default-features --features net \
         --example dedicated_server --example join || exit 2
     BIN=$(cargo metadata --format-version 1 --no-deps |
         sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release/examples

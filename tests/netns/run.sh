@@ -36,7 +36,7 @@ trap cleanup EXIT
 trap 'exit 130' INT TERM HUP
 
 if [ -z "${BIN:-}" ]; then
-    cargo build --release -p pliant --no-default-features --features net \
+    cargo build --release -p pliant_examples --no-default-features --features net \
         --example dedicated_server --example join || exit 2
     BIN=$(cargo metadata --format-version 1 --no-deps |
         sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release/examples

@@ -62,15 +62,17 @@
 //! | Feature | Default | What it adds |
 //! | --- | --- | --- |
 //! | `render` | yes | Bevy's renderer, which draws the bodies |
-//! | `window` | yes | the usual parts of a windowed game: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
-//! | `wayland` | no | native Wayland windows (building needs the Wayland client headers) |
-//! | `contact` | yes | obstacles that bodies touch, and bodies that touch each other |
-//! | `contact-mesh` | yes | convex hulls and triangle meshes as obstacles |
-//! | `net` | yes | sessions over QUIC |
-//! | `haptics` | yes | haptic devices and the device loop |
-//! | `rerun` | yes | the client of the rerun viewer |
-//! | `panel` | yes | the live panel (egui) |
-//! | `bake` | yes | meshing and baking inside the game |
+//! | `picking` | yes | Bevy's picking, with which pointers drag the bodies |
+//! | `contact` | no | obstacles that bodies touch, and bodies that touch each other |
+//! | `contact-mesh` | no | convex hulls and triangle meshes as obstacles |
+//! | `net` | no | sessions over QUIC |
+//! | `haptics` | no | haptic devices and the device loop |
+//! | `rerun` | no | the client of the rerun viewer |
+//! | `panel` | no | the live panel (egui) |
+//! | `bake` | no | meshing and baking inside the game |
+//!
+//! None of them asks Bevy for a window, a user interface, threads (`multi_threaded`) or types that
+//! register themselves (`reflect_auto_register`). These are the game's to choose.
 
 #![cfg_attr(
     test,
@@ -161,15 +163,15 @@ impl PluginGroup for PliantPlugins {
 pub mod prelude {
     pub use crate::PliantPlugins;
     pub use crate::body::{
-        BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Impulse, Inertia, Integrator,
-        ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems,
-        PliantTick, Push, Relaxation, RideOn, RidingPlugin, SingleSteps, StepSettings, SurfaceAnchor,
-        SurfacePlace, Teleport, VisualState,
+        BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed, Grabs, Impulse, Inertia,
+        Integrator, ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems,
+        PliantSystems, PliantTick, Push, Relaxation, Released, RideOn, RidingPlugin, SingleSteps,
+        StepSettings, SurfaceAnchor, SurfacePlace, Teleport, VisualState,
     };
+    #[cfg(feature = "render")]
+    pub use crate::body::{PliantGizmos, SurfaceDeformation, SurfaceDetail, SurfaceShading};
     #[cfg(feature = "picking")]
     pub use crate::body::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
-    #[cfg(feature = "render")]
-    pub use crate::body::{SurfaceDeformation, SurfaceDetail, SurfaceShading};
     #[cfg(feature = "contact")]
     pub use crate::contact::{
         BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,
@@ -186,14 +188,14 @@ pub mod prelude {
 }
 
 /// Compiles the code of the README.
-#[cfg(all(doctest, feature = "window", feature = "net", feature = "haptics"))]
+#[cfg(all(doctest, feature = "render", feature = "net", feature = "haptics"))]
 #[doc = include_str!("../../../README.md")]
 pub struct Readme;
 
 /// Compiles the code of the book, and runs the blocks that are not marked `no_run`.
 #[cfg(all(
     doctest,
-    feature = "window",
+    feature = "render",
     feature = "net",
     feature = "haptics",
     feature = "rerun",

@@ -103,7 +103,9 @@ const SCENES: [(&str, &str, &[&str]); 6] = [
 
 #[test]
 fn a_scene_compiles_nothing_that_it_does_not_need() {
-    let everything = crates("pliant", &[]);
+    let everything = crates("pliant", &["--all-features"]);
+    // The window and what is drawn in it are the game's, which here are the examples.
+    let game = crates("pliant_examples", &[]);
     for (name, features, without) in SCENES {
         let list = with(features);
         println!("{name} ({features}): {} crates of {}", list.len(), everything.len());
@@ -115,7 +117,7 @@ fn a_scene_compiles_nothing_that_it_does_not_need() {
     }
     let named = SCENES.iter().flat_map(|scene| scene.2).chain(&RENDERER);
     for pattern in named {
-        let found = matching(&everything, pattern);
+        let found = matching(&game, pattern);
         assert!(!found.is_empty(), "{pattern} is no crate of ours at all: the list is out of date");
     }
 }
@@ -148,6 +150,35 @@ fn a_feature_that_is_off_compiles_none_of_its_crates() {
     }
 }
 
+/// Tests that no feature of ours chooses the window, the user interface or the threads of a game,
+/// and what the default features are.
+#[test]
+fn what_is_the_games_to_choose_is_not_chosen_by_us() {
+    let asked = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO"))
+            .args(["tree", "--locked", "-p", "pliant", "-e", "features,normal", "--prefix", "none"])
+            .args(["-f", "{p} {f}"])
+            .args(arguments)
+            .current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
+            .output()
+            .unwrap();
+        let text = String::from_utf8(output.stdout).unwrap();
+        let line = text.lines().find(|line| line.starts_with("bevy_internal v")).unwrap().to_owned();
+        let features = line.split(' ').nth(2).unwrap();
+        features.split(',').map(str::to_owned).collect::<BTreeSet<_>>()
+    };
+    let choices = ["x11", "wayland", "bevy_winit", "bevy_ui", "bevy_ui_render", "default_font", "png"];
+    for arguments in [&[][..], &["--all-features"]] {
+        let features = asked(arguments);
+        println!("pliant {arguments:?} asks of Bevy: {features:?}");
+        lacks(&features, &choices, "pliant");
+        lacks(&features, &["multi_threaded", "reflect_auto_register*"], "pliant");
+        assert!(features.contains("bevy_pbr"), "the features are read wrongly: {features:?}");
+    }
+    let without: Vec<&str> = FEATURES.iter().filter(|f| f.0 != "render").flat_map(|f| f.1).copied().collect();
+    lacks(&crates("pliant", &[]), &without, "pliant with its default features");
+}
+
 #[test]
 fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
     for package in ["pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream", "pliant_lab"] {
@@ -159,7 +190,7 @@ fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
 fn only_the_program_imports_the_laboratory() {
     // The package `pliant` with all features compiles every crate that an app can have.
     for package in ["pliant", "pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream"] {
-        lacks(&crates(package, &[]), &["pliant_lab"], package);
+        lacks(&crates(package, &["--all-features"]), &["pliant_lab"], package);
     }
     assert!(crates("pliant_cli", &[]).contains("pliant_lab"));
     // The protocol depends on no mesh and no bake. The laboratory depends neither on the plugins
