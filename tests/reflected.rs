@@ -6,7 +6,10 @@ use std::{fs, path::Path};
 
 use bevy::{
     app::{App, MainSchedulePlugin},
-    ecs::reflect::{AppTypeRegistry, ReflectComponent, ReflectResource},
+    ecs::{
+        reflect::{AppTypeRegistry, ReflectComponent, ReflectResource},
+        schedule::ScheduleLabel,
+    },
     prelude::*,
     reflect::ReflectFromReflect,
     transform::TransformPlugin,
