@@ -207,11 +207,12 @@ fn worst(who: Who, seeds: u64, lasts: Duration) -> (f64, Outcome) {
 fn check(seeds: u64, lasts: Duration) {
     let (_, calm) = worst(Who::Nobody, seeds, lasts);
     for who in [Who::Host, Who::Guest, Who::Both] {
-        let (ratio, Outcome { truth, back, .. }) = worst(who, seeds, lasts);
+        let (ratio, Outcome { truth, back, off, .. }) = worst(who, seeds, lasts);
         assert!(ratio <= MAX_SHOWN, "{who:?}: shown {ratio:.3} of the true reaction");
         let most = MAX_TRUE * calm.truth;
         assert!(truth <= most, "{who:?}: true {truth:.2} N, {:.2} N without stalls", calm.truth);
         assert!(back <= BACK_WITHIN, "{who:?}: the shape is back after {back:?}");
+        assert!(off <= BACK, "{who:?}: the shape is off by {:.2} % afterwards", 100.0 * off);
     }
 }
 
