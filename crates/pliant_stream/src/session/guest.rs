@@ -385,12 +385,14 @@ impl GuestSession {
         for id in ids {
             if let Some(view) = self.bodies.get_mut(&id) {
                 stepped += view.advance(now, user, round_trip);
-                if view.is_stalled() {
-                    if self.stalled.insert(id) {
-                        self.event(GuestEvent::Stalled { body: id });
-                    }
-                } else {
+                let (stalls, resynced) = (view.is_stalled(), std::mem::take(&mut view.resynced));
+                if !stalls {
                     self.stalled.remove(&id);
+                } else if self.stalled.insert(id) {
+                    self.event(GuestEvent::Stalled { body: id });
+                }
+                if resynced {
+                    self.event(GuestEvent::Resynced { body: id });
                 }
             }
             self.ask(now, id);

@@ -22,6 +22,9 @@ const MAX_REQUESTS: u8 = 12;
 const REQUEST_WITHIN: u64 = 200;
 /// Backlog beyond which the receiver does not catch up tick by tick, ticks. A snapshot is faster.
 const CATCH_UP: u64 = 120;
+/// A snapshot of a later tick waits until that tick is shown, at most this many ticks. One from
+/// further ahead is faster than the ticks up to it.
+const WAIT_FOR_TICK: u64 = 40;
 /// Silence after which the host may have paused.
 const QUIET: Duration = Duration::from_millis(100);
 
@@ -50,6 +53,7 @@ pub struct StreamedBody {
     config: RecoveryConfig,
     newmark: Newmark,
     waiting: Vec<TickFrame>,
+    /// A snapshot that waits for the model, or for its tick.
     snapshot: Option<SnapshotBytes>,
     /// Frames after a silence until the schedule knows whether the host has paused.
     waits_for: usize,
@@ -242,24 +246,38 @@ impl StreamedBody {
         self.resting = snapshot.resting;
         self.received_at = now;
         self.wants_snapshot = false;
-        self.resolved = self.resolved.max(snapshot.tick);
         let modes = snapshot.q.len();
         let retuned = std::mem::take(&mut self.retuned);
-        if let Some(receiver) = &mut self.receiver
+        if let Some(receiver) = &self.receiver
             && receiver.confirmed().modes() == modes
             && !retuned
         {
-            receiver.restart(&snapshot);
-            self.resynced = true;
+            // At once, a snapshot of a later tick would move the shown shape by the way of the body
+            // until then.
+            let ahead = snapshot.tick.saturating_sub(receiver.tick());
+            self.snapshot = Some(snapshot);
+            if self.resting || !(1..=WAIT_FOR_TICK).contains(&ahead) {
+                self.resync();
+            }
             return false;
         }
         // The receiver is rebuilt for another number of modes or other step settings.
+        self.resolved = self.resolved.max(snapshot.tick);
         let again = self.receiver.take().is_some();
         self.snapshot = Some(snapshot);
         let ready = self.begin();
         self.resynced |= again && ready;
         self.changed |= again && ready && retuned;
         ready && !again
+    }
+
+    /// Restarts from the snapshot that waits for its tick, if there is one.
+    fn resync(&mut self) {
+        let Some(receiver) = &mut self.receiver else { return };
+        let Some(snapshot) = self.snapshot.take() else { return };
+        receiver.restart(&snapshot);
+        self.resolved = self.resolved.max(snapshot.tick);
+        self.resynced = true;
     }
 
     fn begin(&mut self) -> bool {
@@ -330,14 +348,26 @@ impl StreamedBody {
         }
         self.resting = frame.resting;
         receiver.accept(&frame);
+        if self.resting {
+            self.resync();
+        }
     }
 
     /// Steps to all ticks that are due by now. Returns the number of ticks.
     pub(crate) fn advance(&mut self, now: Duration, user: UserId, round_trip: Duration) -> u64 {
         let guesses = self.guesses();
-        let Some(receiver) = &mut self.receiver else { return 0 };
+        if self.receiver.is_none() {
+            return 0;
+        }
         let quiet = if self.resting { Duration::ZERO } else { now.saturating_sub(self.received_at) };
         self.hitches.pass(now, quiet);
+        let quiet = quiet > self.config.stall_after;
+        let behind = |receiver: &Receiver| receiver.tick() + CATCH_UP < receiver.history().highest();
+        if quiet || self.receiver.as_ref().is_some_and(behind) {
+            // The tick of a snapshot that waits is not reached soon.
+            self.resync();
+        }
+        let Some(receiver) = &mut self.receiver else { return 0 };
         if self.resting {
             self.stalled = false;
             if now >= self.fade_at && receiver.is_fading() {
@@ -346,12 +376,13 @@ impl StreamedBody {
             }
             return 0;
         }
-        let quiet = quiet > self.config.stall_after;
         let highest = receiver.history().highest();
         self.stalled = quiet && receiver.tick() >= highest;
         let most = highest + guesses;
         let mut stepped = 0;
-        while let Some(due) = self.playout.due(receiver.tick() + 1) {
+        while let Some(receiver) = &mut self.receiver
+            && let Some(due) = self.playout.due(receiver.tick() + 1)
+        {
             // Prediction never runs far beyond the newest received tick, whatever the schedule
             // says.
             if due > now || (quiet && receiver.tick() >= highest) || receiver.tick() >= most {
@@ -363,6 +394,10 @@ impl StreamedBody {
             }
             receiver.advance();
             stepped += 1;
+            if self.snapshot.as_ref().is_some_and(|snapshot| snapshot.tick <= receiver.tick()) {
+                self.resync();
+            }
+            let Some(receiver) = &self.receiver else { break };
             if let Some(data) = receiver.history().known(receiver.tick()) {
                 // What is shown may still contain the error of a prediction. This was sent.
                 let own = data.grabs.iter().filter(|g| g.state.key.user == user);
@@ -395,7 +430,8 @@ impl StreamedBody {
             }
             self.fade_at = now + Duration::from_secs_f64(self.newmark.h);
         }
-        if self.config.snapshots && self.receiver.as_ref().is_some_and(Receiver::wants_snapshot) {
+        let waits = self.snapshot.is_some();
+        if self.config.snapshots && !waits && self.receiver.as_ref().is_some_and(Receiver::wants_snapshot) {
             self.wants_snapshot = true;
         }
         stepped
