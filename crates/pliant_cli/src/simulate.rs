@@ -21,7 +21,7 @@ pub(crate) struct SimulateArgs {
 }
 
 pub(crate) fn run(args: &SimulateArgs) -> Result<(), CliError> {
-    let settings = SimulateSettings { from: args.from, seeds: args.seeds };
+    let settings = SimulateSettings { from: args.from, seeds: args.seeds, memory: None };
     let report = simulate(&settings, &mut Bar::new()).map_err(CliError::from)?;
     if args.json {
         output::print_json(&report)?
@@ -46,12 +46,13 @@ fn text(report: &SimulateReport) -> String {
     let faults: Vec<String> = report.faults.iter().map(|(kind, count)| format!("{kind} {count}")).collect();
     let _ = write!(
         text,
-        "{} sessions of {:.0} s, {} ticks; faults: {}; largest reaction told over the largest true one \
+        "{} sessions of {:.0} s, {} ticks; faults that took effect: {}, of {} drawn; largest reaction told over the largest true one \
          {:.3}; {} broke; {:.0} s",
         report.seeds,
         report.virtual_seconds / report.seeds.max(1) as f64,
         report.ticks,
         faults.join(", "),
+        report.drawn,
         report.largest_share,
         report.failures.len(),
         report.seconds

@@ -12,7 +12,10 @@ use pliant_stream::{BodyId, Channel, DisconnectReason, Output, PeerId, StepSetti
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::{Processes, disturbed, network};
-use super::{AGREES, END, Fault, FaultKind, HEALED, IDLE, LOOK, MAX_FORCE, Outcome, apart, hand, hold, norm};
+use super::{
+    AGREES, Digest, END, Fault, FaultKind, HEALED, IDLE, LOOK, MAX_FORCE, MAX_MEMORY, Memory, Outcome, apart,
+    hand, hold, norm,
+};
 
 const BODY: BodyId = BodyId(1);
 /// Ticks that may lie between two peers, or between a peer and its newest final tick, at the end.
@@ -71,6 +74,7 @@ struct Mesh {
     random: Random,
     now: Duration,
     ticks: u64,
+    digest: Digest,
     broken: Option<String>,
 }
 
@@ -89,20 +93,20 @@ pub(super) fn run(
     seed: u64,
     count: usize,
     faults: &[Fault],
-    random: Random,
+    (mut random, mut memory): (Random, Memory),
 ) -> Result<Outcome, String> {
-    let mut random = random;
     let path = network(&mut random);
     let mut mesh = Mesh {
         model: model.clone(),
         nodes: Vec::new(),
         wires: Vec::new(),
-        processes: Processes::new(count),
+        processes: Processes::default(),
         mischief: Mischief::default(),
         path,
         random: Random::new(!seed ^ random.next()),
         now: Duration::ZERO,
         ticks: 0,
+        digest: Digest::EMPTY,
         broken: None,
     };
     for process in 0..count {
@@ -139,6 +143,8 @@ pub(super) fn run(
             mesh.turn(process)?;
         }
         mesh.now += LOOK;
+        let held = memory.look();
+        mesh.ensure(held <= MAX_MEMORY[0], || format!("the session holds {held} bytes"));
         if mesh.now + Duration::from_secs(1) > END {
             mesh.agree();
         }
@@ -146,7 +152,17 @@ pub(super) fn run(
             return Err(broken);
         }
     }
-    Ok(Outcome { ticks: mesh.ticks, share: 0.0 })
+    let held = memory.look();
+    if held > MAX_MEMORY[1] {
+        return Err(format!("the session holds {held} bytes at its end"));
+    }
+    Ok(Outcome {
+        ticks: mesh.ticks,
+        share: 0.0,
+        took: mesh.processes.took(),
+        digest: mesh.digest,
+        memory: [memory.largest, held],
+    })
 }
 
 impl Mesh {
@@ -177,6 +193,10 @@ impl Mesh {
             return;
         }
         self.processes.begin(fault);
+        let lives = self.nodes[fault.process].session.is_some();
+        if lives && matches!(fault.kind, FaultKind::ClockJump | FaultKind::Crash) {
+            self.processes.take_last();
+        }
         match fault.kind {
             FaultKind::ClockJump => self.nodes[fault.process].ahead += fault.lasts,
             FaultKind::Crash => self.nodes[fault.process].session = None,
@@ -185,6 +205,7 @@ impl Mesh {
                 let other = others.clone().nth(self.random.index(others.count().max(1))).unwrap_or(0);
                 let known = self.nodes[fault.process].session.as_ref().is_some_and(|s| s.tick() > 0);
                 if known && other != fault.process {
+                    self.processes.take_last();
                     self.dial(fault.process, other, Some(number(other)));
                 }
             }
@@ -218,7 +239,11 @@ impl Mesh {
     /// One look of a process: it reads, steps and sends.
     fn turn(&mut self, process: usize) -> Result<(), String> {
         let now = self.now;
-        if self.processes.is_down(process, now) || self.processes.is_stalled(process, now) {
+        if self.processes.is_down(process, now) {
+            return Ok(());
+        }
+        if self.processes.is_stalled(process, now) {
+            self.processes.take(process, &[FaultKind::Stall, FaultKind::Starvation], now);
             return Ok(());
         }
         if self.nodes[process].session.is_none() {
@@ -297,6 +322,8 @@ impl Mesh {
         self.ticks += stepped;
         let Some(body) = session.body(BODY).filter(|_| stepped > 0) else { return };
         let finite = body.visual().is_finite() && body.live().is_finite();
+        self.digest.add_all(&body.visual().q);
+        body.grabs().iter().for_each(|grab| self.digest.add_all(&grab.reaction));
         let honest = body.grabs().iter().filter(|grab| grab.key.user != malicious);
         let force = honest.map(|grab| norm(grab.reaction)).fold(0.0, f64::max);
         let hands = body.grabs().len();
@@ -390,6 +417,9 @@ impl Mesh {
                     out.push((index, Packet::Close));
                 } else if malicious && side.open {
                     let lies = self.mischief.packets(&mut self.random);
+                    if let Some(kind) = self.mischief.now.filter(|_| !lies.is_empty()) {
+                        self.processes.take(process, &[kind], self.now);
+                    }
                     out.extend(lies.into_iter().map(|(channel, bytes)| (index, packet(channel, bytes))));
                 }
             }
@@ -399,6 +429,10 @@ impl Mesh {
             let Some(wire) = self.wires.get_mut(index) else { continue };
             let at = usize::from(wire.sides[0].process != process);
             let other = wire.sides[1 - at].process;
+            // Something is sent, which a partition or a bad network meets.
+            for end in [process, other] {
+                self.processes.take(end, &[FaultKind::Partition, FaultKind::BadNetwork], now);
+            }
             let bad = self.processes.is_disturbed(process, now) || self.processes.is_disturbed(other, now);
             let link = if bad { disturbed(&self.path) } else { self.path.clone() };
             let side = &mut wire.sides[at];

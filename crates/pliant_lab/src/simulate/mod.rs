@@ -43,6 +43,11 @@ const SPRING: f64 = 50.0;
 const MAX_FORCE: f64 = 1000.0;
 /// Largest difference after the end of all faults, as a share of the largest shape.
 const AGREES: f64 = 0.02;
+/// Looks of the last second at which somebody's state has to be comparable with another's.
+const COMPARED: u32 = 100;
+/// Largest memory of a session at any time, and at its end, bytes. What is in flight counts too,
+/// and what a flood has sent to a process that stalls.
+const MAX_MEMORY: [i64; 2] = [64 << 20, 8 << 20];
 
 /// What to simulate.
 #[derive(Debug, Clone, Copy)]
@@ -51,6 +56,9 @@ pub struct SimulateSettings {
     pub from: u64,
     /// Number of seeds.
     pub seeds: u64,
+    /// Returns the memory that this thread has allocated and not freed, bytes. With it, the memory
+    /// of each session is bounded. Default: none.
+    pub memory: Option<fn() -> i64>,
 }
 
 /// A seed whose session broke what must hold.
@@ -73,8 +81,14 @@ pub struct SimulateReport {
     pub ticks: u64,
     /// Virtual time of all sessions, s.
     pub virtual_seconds: f64,
-    /// Number of faults by kind.
+    /// Number of faults by kind that have changed something: nobody is stalled who is not there.
     pub faults: BTreeMap<&'static str, u64>,
+    /// Number of faults that were drawn.
+    pub drawn: u64,
+    /// A digest of the shapes and reactions of all sessions. Equal seeds give equal digests.
+    pub digest: u64,
+    /// Largest memory of a session at any time, and at its end, bytes; 0 where it is not measured.
+    pub largest_memory: [i64; 2],
     /// Largest reaction that a guest's hand was told of, over the largest true one of its session.
     pub largest_share: f64,
     /// What broke.
@@ -84,10 +98,52 @@ pub struct SimulateReport {
 }
 
 /// What one session gives.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Outcome {
     ticks: u64,
     share: f64,
+    took: Vec<FaultKind>,
+    digest: Digest,
+    memory: [i64; 2],
+}
+
+/// A digest of numbers in their order (FNV-1a over their bits).
+#[derive(Debug, Clone, Copy)]
+struct Digest(u64);
+
+impl Digest {
+    const EMPTY: Self = Self(0xCBF2_9CE4_8422_2325);
+
+    fn add(&mut self, bits: u64) {
+        for byte in bits.to_le_bytes() {
+            self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
+        }
+    }
+
+    fn add_all(&mut self, values: &[f64]) {
+        values.iter().for_each(|value| self.add(value.to_bits()));
+    }
+}
+
+/// The memory of one session, which runs on one thread.
+#[derive(Debug, Clone, Copy)]
+struct Memory {
+    probe: Option<fn() -> i64>,
+    before: i64,
+    largest: i64,
+}
+
+impl Memory {
+    fn new(probe: Option<fn() -> i64>) -> Self {
+        Self { probe, before: probe.map_or(0, |probe| probe()), largest: 0 }
+    }
+
+    /// Returns the memory that the session has now, bytes.
+    fn look(&mut self) -> i64 {
+        let now = self.probe.map_or(0, |probe| probe() - self.before);
+        self.largest = self.largest.max(now);
+        now
+    }
 }
 
 /// Simulates the sessions of some seeds, on all cores.
@@ -103,19 +159,26 @@ pub fn simulate(
     let began = Instant::now();
     let model = body()?;
     let mut report = SimulateReport { seeds: settings.seeds, ..SimulateReport::default() };
+    let (memory, mut digest) = (settings.memory, Digest::EMPTY);
     // In chunks, so that progress can be reported.
     let end = settings.from.saturating_add(settings.seeds);
     let mut next = settings.from;
     while next < end {
         let until = next.saturating_add(64).min(end);
-        let done: Vec<_> = (next..until).into_par_iter().map(|seed| (seed, session(seed, &model))).collect();
+        let all = (next..until).into_par_iter().map(|seed| (seed, session(seed, &model, memory)));
+        let done: Vec<_> = all.collect();
         for (seed, (faults, outcome)) in done {
             report.virtual_seconds += END.as_secs_f64();
-            for fault in &faults {
-                *report.faults.entry(fault.kind.name()).or_default() += 1;
-            }
+            report.drawn += faults.len() as u64;
             match outcome {
                 Ok(outcome) => {
+                    for kind in &outcome.took {
+                        *report.faults.entry(kind.name()).or_default() += 1;
+                    }
+                    digest.add(outcome.digest.0);
+                    for (largest, memory) in report.largest_memory.iter_mut().zip(outcome.memory) {
+                        *largest = memory.max(*largest);
+                    }
                     report.ticks += outcome.ticks;
                     report.largest_share = report.largest_share.max(outcome.share);
                 }
@@ -129,17 +192,23 @@ pub fn simulate(
         progress.report("simulate", (next - settings.from) as f64 / settings.seeds.max(1) as f64);
     }
     report.seconds = began.elapsed().as_secs_f64();
+    report.digest = digest.0;
     Ok(report)
 }
 
 /// The session of a seed.
-fn session(seed: u64, model: &Arc<ModalModel>) -> (Vec<Fault>, Result<Outcome, String>) {
+fn session(
+    seed: u64,
+    model: &Arc<ModalModel>,
+    probe: Option<fn() -> i64>,
+) -> (Vec<Fault>, Result<Outcome, String>) {
     let mut random = schedule::Random::new(seed);
     let processes = 3 + random.index(2);
     let faults = schedule::schedule(&mut random, processes, FAULTS[0], FAULTS[1]);
+    let memory = Memory::new(probe);
     let run = || match seed % 2 {
-        0 => star::run(model, seed, processes, &faults, random.clone()),
-        _ => mesh::run(model, seed, processes, &faults, random.clone()),
+        0 => star::run(model, seed, processes, &faults, (random.clone(), memory)),
+        _ => mesh::run(model, seed, processes, &faults, (random.clone(), memory)),
     };
     let outcome = catch_unwind(AssertUnwindSafe(run)).unwrap_or_else(|panic| {
         let text = panic.downcast_ref::<String>().map(String::as_str);

@@ -15,7 +15,10 @@ use pliant_stream::{
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::Processes;
-use super::{AGREES, END, Fault, FaultKind, IDLE, LOOK, MAX_FORCE, Outcome, apart, hand, hold, norm};
+use super::{
+    AGREES, COMPARED, Digest, END, Fault, FaultKind, IDLE, LOOK, MAX_FORCE, MAX_MEMORY, Memory, Outcome,
+    apart, hand, hold, norm,
+};
 use crate::pair::{Pair, PathConfig, World};
 
 const BODY: BodyId = BodyId(1);
@@ -25,6 +28,8 @@ const PLAYOUT: (usize, f64) = (2, 20.0 / 40.0);
 const SETTLED: Duration = Duration::from_secs(3);
 /// The grabs that a flood begins and ends.
 const FLOOD_GRABS: std::ops::Range<u16> = 100..104;
+/// Ticks that a guest may show before the host has made them: guesses while frames are lost.
+const AHEAD: u64 = 4;
 /// Ticks of the host that are kept to compare with.
 const KEPT: usize = 400;
 /// Largest reaction told over the largest true one, without and with a malicious guest: a fifth
@@ -54,6 +59,7 @@ struct Apps {
     mischief: Mischief,
     random: Random,
     ticks: u64,
+    digest: Digest,
     broken: Option<String>,
 }
 
@@ -123,6 +129,7 @@ impl World for Apps {
             }
         }
         let (q, v, a) = (self.body.q(), self.body.v(), self.body.a());
+        self.digest.add_all(q);
         let finite = q.iter().chain(v).all(|x| x.is_finite());
         let state = TickState { tick, q, v, a, z: &[], pose: None, grabs: &grabs, resting: false };
         let published = host.publish(now, BODY, &state);
@@ -194,6 +201,7 @@ impl World for Apps {
         let Some(user) = session.user() else { return };
         let Some(view) = session.body(BODY).filter(|view| stepped > 0 && view.is_ready()) else { return };
         let finite = view.visual().is_none_or(|shown| shown.is_finite());
+        view.visual().into_iter().for_each(|shown| self.digest.add_all(&shown.q));
         self.ensure(finite, || format!("{} shows what is not finite", name(process)));
         let most = 16 * self.largest.len();
         let (hands, users) = (view.grabs().len(), session.users().count());
@@ -202,6 +210,7 @@ impl World for Apps {
         });
         if let Some(shown) = grab.and_then(|grab| view.hand_reaction(user, grab)) {
             let force = norm(shown);
+            self.digest.add_all(&shown);
             let fair = force <= MAX_FORCE || process == self.malicious();
             self.ensure(fair, || format!("{} is told of {force} N", name(process)));
             // A hand that has only just taken hold is ahead of what the host has made of it.
@@ -238,6 +247,8 @@ struct Star {
     /// When a process that has lost its session tries again.
     again: Vec<Option<Duration>>,
     host_was_down: bool,
+    /// Looks of the last second at which a process showed a tick that the host has made.
+    compared: Vec<u32>,
     path: LinkConfig,
     random: Random,
 }
@@ -260,7 +271,7 @@ pub(super) fn run(
     seed: u64,
     count: usize,
     faults: &[Fault],
-    random: Random,
+    (random, mut memory): (Random, Memory),
 ) -> Result<Outcome, String> {
     let host = host_session(model)?;
     let mut pair = Pair::new(*host.config()).map_err(|e| e.to_string())?;
@@ -277,6 +288,7 @@ pub(super) fn run(
         mischief: Mischief::default(),
         random: Random::new(!seed),
         ticks: 0,
+        digest: Digest::EMPTY,
         broken: None,
     };
     let mut random = random;
@@ -284,10 +296,11 @@ pub(super) fn run(
     let mut star = Star {
         pair,
         apps,
-        processes: Processes::new(count),
+        processes: Processes::default(),
         guest: vec![None; count],
         again: vec![Some(Duration::ZERO); count],
         host_was_down: false,
+        compared: vec![0; count],
         path,
         random,
     };
@@ -302,6 +315,8 @@ pub(super) fn run(
         now += LOOK;
         star.apps.now = now;
         star.pair.run_until(now, &mut star.apps);
+        let held = memory.look();
+        star.apps.ensure(held <= MAX_MEMORY[0], || format!("the session holds {held} bytes"));
         if now + Duration::from_secs(1) > END {
             star.agree();
         }
@@ -309,12 +324,25 @@ pub(super) fn run(
             return Err(broken);
         }
     }
+    let held = memory.look();
+    if held > MAX_MEMORY[1] {
+        return Err(format!("the session holds {held} bytes at its end"));
+    }
+    if let Some(process) = (1..count - 1).find(|process| star.compared[*process] < COMPARED) {
+        return Err(format!("{} shows nothing that the host has made", name(process)));
+    }
     let shares = star.apps.largest[1..count - 1].iter().map(|(shown, truth)| shown / truth.max(1e-9));
     let share = shares.fold(0.0, f64::max);
     if share > MAX_SHARE[usize::from(attacked)] {
         return Err(format!("a hand was told of {share:.3} times the largest true reaction"));
     }
-    Ok(Outcome { ticks: star.apps.ticks, share })
+    Ok(Outcome {
+        ticks: star.apps.ticks,
+        share,
+        took: star.processes.took(),
+        digest: star.apps.digest,
+        memory: [memory.largest, held],
+    })
 }
 
 impl Star {
@@ -327,8 +355,11 @@ impl Star {
                 self.pair.cut(guest);
                 self.again[fault.process] = Some(fault.at);
             }
-            _ => {}
+            // The host's own end is in `look`.
+            (FaultKind::Crash, None) => {}
+            _ => return,
         }
+        self.processes.take_last();
     }
 
     /// Does what is due: processes stall, links break, and who has lost the session comes back.
@@ -342,6 +373,10 @@ impl Star {
         }
         self.host_was_down = down;
         let host_stalls = down || self.processes.is_stalled(0, now);
+        let slow = [FaultKind::Stall, FaultKind::Starvation];
+        if host_stalls && !down {
+            self.processes.take(0, &slow, now);
+        }
         self.pair.stall_host(host_stalls);
         let malicious = self.apps.malicious();
         for process in 1..self.guest.len() {
@@ -350,6 +385,13 @@ impl Star {
             if let Some(guest) = self.guest[process] {
                 self.pair.stall_guest(guest, stalled);
                 self.pair.part(guest, parted);
+                if self.pair.guests[guest].session.user().is_some() {
+                    self.processes.take(process, &[FaultKind::Partition, FaultKind::BadNetwork], now);
+                    self.processes.take(0, &[FaultKind::Partition, FaultKind::BadNetwork], now);
+                    if stalled {
+                        self.processes.take(process, &slow, now);
+                    }
+                }
                 let bad = self.processes.is_disturbed(process, now) || self.processes.is_disturbed(0, now);
                 let link = if bad { super::state::disturbed(&self.path) } else { self.path.clone() };
                 let end = &mut self.pair.guests[guest];
@@ -402,7 +444,11 @@ impl Star {
                 self.pair.send_as(guest, Channel::Message, GuestMessage::GrabEnd { grab }.encode());
             }
         }
-        for (channel, bytes) in self.apps.mischief.packets(&mut self.random) {
+        let packets = self.apps.mischief.packets(&mut self.random);
+        if let Some(kind) = self.apps.mischief.now.filter(|_| !packets.is_empty()) {
+            self.processes.take(malicious, &[kind], now);
+        }
+        for (channel, bytes) in packets {
             self.pair.send_as(guest, channel, bytes);
         }
         if self.apps.mischief.now == Some(FaultKind::Flood) {
@@ -449,9 +495,10 @@ impl Star {
                 return self.apps.ensure(false, || format!("{name} has no body"));
             };
             let (shown, hands) = (view.tick(), view.grabs().len());
-            let near = shown + 40 > tick;
+            let near = (tick.saturating_sub(39)..=tick + AHEAD).contains(&shown);
             let truth = self.apps.truth.iter().rev().find(|(tick, _)| *tick == shown);
-            // A guest may show a tick or two that the host has yet to make.
+            // There is none for a tick that the host has yet to make.
+            self.compared[process] += u32::from(truth.is_some());
             let off = truth.zip(view.visual()).map_or(0.0, |((_, q), shown)| apart(q, &shown.q) / size);
             let held = view.grabs().iter().any(|grab| Some(grab.key.user) == number);
             self.apps.ensure(missing.is_none(), || format!("{name} does not know of {missing:?}"));

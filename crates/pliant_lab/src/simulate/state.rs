@@ -7,70 +7,71 @@ use pliant_stream::emulator::{LinkConfig, Loss};
 use super::schedule::Random;
 use super::{Fault, FaultKind, HEALED, LOOK};
 
-#[derive(Debug, Clone, Default)]
-struct Process {
-    down: Duration,
-    stalled: Duration,
-    starved: Duration,
-    parted: Duration,
-    disturbed: Duration,
+/// A fault that has begun.
+#[derive(Debug)]
+struct Begun {
+    fault: Fault,
+    until: Duration,
+    /// It has changed something.
+    took: bool,
 }
 
-/// Until when each process suffers what.
-#[derive(Debug)]
-pub(super) struct Processes {
-    all: Vec<Process>,
-    attack: Option<(FaultKind, Duration)>,
-}
+/// Which process suffers what, and until when.
+#[derive(Debug, Default)]
+pub(super) struct Processes(Vec<Begun>);
 
 impl Processes {
-    pub(super) fn new(count: usize) -> Self {
-        Self { all: vec![Process::default(); count], attack: None }
-    }
-
     pub(super) fn begin(&mut self, fault: Fault) {
         let until = (fault.at + fault.lasts).min(HEALED);
-        let Some(process) = self.all.get_mut(fault.process) else { return };
-        let lasts = match fault.kind {
-            FaultKind::Crash => &mut process.down,
-            FaultKind::Stall => &mut process.stalled,
-            FaultKind::Starvation => &mut process.starved,
-            FaultKind::Partition => &mut process.parted,
-            FaultKind::BadNetwork => &mut process.disturbed,
-            FaultKind::ClockJump | FaultKind::SecondConnection => return,
-            FaultKind::Garbage | FaultKind::Replay | FaultKind::Flood => {
-                self.attack = Some((fault.kind, until));
-                return;
-            }
-        };
-        *lasts = until.max(*lasts);
+        self.0.push(Begun { fault, until, took: false });
     }
 
-    fn of(&self, process: usize, until: fn(&Process) -> Duration, now: Duration) -> bool {
-        self.all.get(process).is_some_and(|process| now < until(process))
+    /// Notes that the faults of some kinds that a process suffers now have changed something.
+    pub(super) fn take(&mut self, process: usize, kinds: &[FaultKind], now: Duration) {
+        for begun in &mut self.0 {
+            let suffers = begun.fault.process == process && now < begun.until;
+            begun.took |= suffers && kinds.contains(&begun.fault.kind);
+        }
+    }
+
+    /// Notes that the fault that began last has changed something.
+    pub(super) fn take_last(&mut self) {
+        self.0.last_mut().into_iter().for_each(|begun| begun.took = true);
+    }
+
+    /// The kinds of the faults that have changed something.
+    pub(super) fn took(&self) -> Vec<FaultKind> {
+        self.0.iter().filter(|begun| begun.took).map(|begun| begun.fault.kind).collect()
+    }
+
+    fn is(&self, process: usize, kind: FaultKind, now: Duration) -> bool {
+        let mut all = self.0.iter().filter(|begun| begun.fault.kind == kind);
+        all.any(|begun| begun.fault.process == process && now < begun.until)
     }
 
     pub(super) fn is_down(&self, process: usize, now: Duration) -> bool {
-        self.of(process, |p| p.down, now)
+        self.is(process, FaultKind::Crash, now)
     }
 
     /// A process that is starved gets one look in eight to forty.
     pub(super) fn is_stalled(&self, process: usize, now: Duration) -> bool {
         let look = (now.as_micros() / LOOK.as_micros()) as usize;
-        let starved = self.of(process, |p| p.starved, now) && !look.is_multiple_of(8 * (1 + process));
-        starved || self.of(process, |p| p.stalled, now)
+        let starved = self.is(process, FaultKind::Starvation, now);
+        self.is(process, FaultKind::Stall, now) || (starved && !look.is_multiple_of(8 * (1 + process)))
     }
 
     pub(super) fn is_parted(&self, process: usize, now: Duration) -> bool {
-        self.of(process, |p| p.parted, now)
+        self.is(process, FaultKind::Partition, now)
     }
 
     pub(super) fn is_disturbed(&self, process: usize, now: Duration) -> bool {
-        self.of(process, |p| p.disturbed, now)
+        self.is(process, FaultKind::BadNetwork, now)
     }
 
+    /// What the malicious member does: the attack that began last.
     pub(super) fn attack(&self, now: Duration) -> Option<FaultKind> {
-        self.attack.filter(|(_, until)| now < *until).map(|(kind, _)| kind)
+        let last = self.0.iter().rev().find(|begun| begun.fault.kind.is_attack());
+        last.filter(|begun| now < begun.until).map(|begun| begun.fault.kind)
     }
 }
 
