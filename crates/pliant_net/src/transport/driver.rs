@@ -423,11 +423,7 @@ async fn read_messages(
                 if let Some(place) = place {
                     place.keep();
                 }
-                let mut message = message;
-                while let Err(back) = shared.inbox.push_message(id, message, most) {
-                    message = back;
-                    room.notified().await;
-                }
+                shared.inbox.put_message(id, message, most, room).await;
             }
             Err(error @ ReadMessageError::TooLong { .. }) => {
                 debug!(peer = id.0, %error, "the connection is closed");
@@ -462,20 +458,19 @@ async fn write_messages(
     send: &mut SendStream,
 ) -> DisconnectReason {
     loop {
-        match peer.outbox.next() {
-            Some(Next::Message(bytes)) => {
+        match peer.outbox.wait_next().await {
+            Next::Message(bytes) => {
                 if write_message(bucket, send, bytes).await.is_err() {
                     std::future::pending::<()>().await;
                 }
             }
-            Some(Next::Close(reason)) => {
+            Next::Close(reason) => {
                 // A stream or connection that is already closed needs no goodbye.
                 let _ = send.finish();
                 let _ = timeout(GRACE, send.stopped()).await;
                 connection.close(code_of(reason), &[]);
                 return reason;
             }
-            None => peer.outbox.message_waits.notified().await,
         }
     }
 }
@@ -524,10 +519,7 @@ fn take_datagram(bucket: &Mutex<Bucket>, len: usize) -> Result<(), Duration> {
 
 async fn write_datagrams(connection: &Connection, peer: &PeerConnection, bucket: &Mutex<Bucket>) {
     loop {
-        let Some(len) = peer.outbox.first_datagram_len() else {
-            peer.outbox.datagram_waits.notified().await;
-            continue;
-        };
+        let len = peer.outbox.first_datagram_len().await;
         if let Err(wait) = take_datagram(bucket, len) {
             sleep(wait).await;
             continue;

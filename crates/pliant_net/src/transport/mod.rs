@@ -26,8 +26,16 @@ mod identity;
 mod invite;
 mod places;
 mod queue;
+#[cfg(test)]
+mod queue_tests;
 mod stats;
 mod wire;
+
+/// What threads share. Tests put loom's in its place.
+mod sync {
+    pub(super) use std::sync::{Arc, Mutex, MutexGuard};
+    pub(super) use tokio::sync::Notify;
+}
 
 pub use config::{ALPN, Access, Grant, HostOptions, JoinOptions, Limits};
 pub use congestion::RateCap;
