@@ -5,8 +5,9 @@
 #
 # Prints the memory, the open handles and the ticks a second of the server and of the guests' process
 # each tenth, and ends with 1 where memory or handles grow by more than a tenth after the first
-# tenth, or where the ticks of the server drift by more than a thousandth from its clock. Binaries:
-# those of BIN, or built by cargo. Ends with 77 (skipped) where a tool is missing.
+# tenth, where the ticks of the server drift by more than a thousandth from its clock, or where a
+# process ends with an error. Binaries: those of BIN, or built by cargo. Ends with 77 (skipped) where
+# a tool is missing.
 set -u
 cd "$(dirname "$0")/.."
 skip() { echo "skipped: $1"; exit 77; }
@@ -48,8 +49,10 @@ for tenth in $(seq 0 10); do
     echo "$line" >>"$work/looks"
     printf '%10s %12s %8s %12s %8s\n' $line
 done
-kill -INT $bots; wait $bots
-kill -INT $server; wait $server
+kill -INT $bots
+wait $bots || { echo "the guests ended with $?: $(tail -1 "$work/bots.log")"; exit 1; }
+kill -INT $server
+wait $server || { echo "the server ended with $?"; exit 1; }
 awk -v bad=0 '
     FNR == NR { if (NR == 2) split($0, first); split($0, last); next }
     # The first and the last window have fewer users.

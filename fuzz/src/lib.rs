@@ -82,19 +82,34 @@ pub fn model_file(bytes: &[u8]) {
     }
 }
 
+/// A temporary folder of a thread, which goes with it.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new() -> Self {
+        let name = format!("pliant-fuzz-{}-{:?}", std::process::id(), std::thread::current().id());
+        let folder = std::env::temp_dir().join(name);
+        std::fs::create_dir_all(&folder).expect("a temporary folder");
+        Self(folder)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        // What is left is in the system's folder for temporary files.
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
 /// Meshes and scenes of all formats. The first byte chooses the format.
 pub fn meshes(bytes: &[u8]) {
     let Some((first, rest)) = bytes.split_first() else { return };
     let ending = FORMATS[usize::from(*first) % FORMATS.len()];
     thread_local! {
         // Readers take a file, since some formats name others beside them.
-        static FOLDER: PathBuf = {
-            let folder = std::env::temp_dir().join(format!("pliant-fuzz-{}", std::process::id()));
-            std::fs::create_dir_all(&folder).expect("a temporary folder");
-            folder
-        };
+        static FOLDER: Folder = Folder::new();
     }
-    let path = FOLDER.with(|folder| folder.join(format!("any.{ending}")));
+    let path = FOLDER.with(|folder| folder.0.join(format!("any.{ending}")));
     std::fs::write(&path, rest).expect("a temporary file");
     let _ = io::read(&path);
 }

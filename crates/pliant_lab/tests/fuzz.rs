@@ -1,19 +1,14 @@
 //! The fuzz targets on a stable compiler: their corpora, and these damaged, for some seconds each.
-//!
-//! `PLIANT_FUZZ_SECONDS` sets the seconds for each target (default 4), and `PLIANT_FUZZ_SEED` where
-//! the damage starts (default 1). What fails is printed in its shortest form.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
+#[path = "support/fuzzing.rs"]
+mod fuzzing;
 mod support;
 #[path = "../../../fuzz/src/lib.rs"]
 mod targets;
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
-
-use proptest::prelude::*;
-use proptest::test_runner::{Config, RngAlgorithm, TestCaseError, TestRng, TestRunner};
+use std::time::Duration;
 
 fn corpus(target: &str) -> Vec<Vec<u8>> {
     let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../fuzz/corpus")).join(target);
@@ -23,80 +18,10 @@ fn corpus(target: &str) -> Vec<Vec<u8>> {
     files.iter().map(|file| std::fs::read(file).unwrap()).collect()
 }
 
-fn number(name: &str, default: u64) -> u64 {
-    std::env::var(name).ok().and_then(|text| text.parse().ok()).unwrap_or(default)
-}
-
-/// One of the corpus with some bytes changed, cut, doubled or put before another one; or any bytes.
-fn damaged(corpus: Vec<Vec<u8>>) -> impl Strategy<Value = Vec<u8>> {
-    let one = prop::sample::select(corpus);
-    let bytes = prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..6);
-    let damage =
-        (one.clone(), one, bytes, any::<prop::sample::Index>(), any::<prop::sample::Index>(), 0..6_u8);
-    prop_oneof![
-        9 => damage.prop_map(|(mut first, second, bytes, at, other, how)| {
-            for (at, value) in bytes {
-                if !first.is_empty() {
-                    let at = at.index(first.len());
-                    first[at] = value;
-                }
-            }
-            let (at, other) = (at.index(first.len() + 1), other.index(second.len() + 1));
-            match how {
-                0 => first.truncate(at),
-                1 => {
-                    first.truncate(at);
-                    first.extend_from_slice(&second[other..]);
-                }
-                2 => first.extend_from_within(at..),
-                3 => {
-                    first.splice(at..at, second.iter().copied().take(other));
-                }
-                _ => {}
-            }
-            first
-        }),
-        1 => prop::collection::vec(any::<u8>(), 0..600),
-    ]
-}
-
-/// Runs a target on its corpus and on damaged copies. Returns the number of executions.
-fn run(name: &str, target: fn(&[u8]), lasts: Duration) -> u64 {
-    let corpus = corpus(name);
-    let mut executions = 0;
-    for bytes in &corpus {
-        target(bytes);
-        executions += 1;
-    }
-    let seed = number("PLIANT_FUZZ_SEED", 1);
-    let strategy = damaged(corpus);
-    let (began, mut batch) = (Instant::now(), 0_u64);
-    while began.elapsed() < lasts {
-        let mut bytes = [0; 32];
-        bytes[..8].copy_from_slice(&seed.to_le_bytes());
-        bytes[8..16].copy_from_slice(&batch.to_le_bytes());
-        let config = Config { cases: 64, failure_persistence: None, ..Config::default() };
-        let mut runner = TestRunner::new_with_rng(config, TestRng::from_seed(RngAlgorithm::ChaCha, &bytes));
-        let outcome = runner.run(&strategy, |bytes| {
-            catch_unwind(AssertUnwindSafe(|| target(&bytes))).map_err(|panic| {
-                let text = panic.downcast_ref::<String>().cloned();
-                TestCaseError::fail(text.unwrap_or_else(|| "a panic".to_owned()))
-            })
-        });
-        assert!(outcome.is_ok(), "{name}, seed {seed}: {}", outcome.unwrap_err());
-        executions += 64;
-        batch += 1;
-    }
-    executions
-}
-
 #[test]
 fn no_bytes_panic_a_parser_or_a_session() {
-    let lasts = Duration::from_secs(number("PLIANT_FUZZ_SECONDS", 4));
     for (name, target) in targets::TARGETS {
-        let executions = run(name, target, lasts);
-        println!("{name}: {executions} executions in {lasts:?}");
-        assert!(executions > 64, "{name}");
+        fuzzing::run(name, corpus(name), target);
     }
 }
 
