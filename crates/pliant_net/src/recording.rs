@@ -10,7 +10,7 @@ use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TrySendError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -30,6 +30,8 @@ const LEVEL: i32 = 3;
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
 /// Largest recording, bytes before compression. This is about a day at 1 Mbit/s.
 const MAX_BYTES: u64 = 12 << 30;
+/// Longest time that the end of a recording waits for its disk.
+const PATIENCE: Duration = Duration::from_secs(10);
 /// Largest record, bytes. The largest records are models.
 const LONGEST: u32 = 1 << 30;
 /// Largest zstd window is 2^27 bytes, so that no file makes a reader allocate more.
@@ -102,12 +104,15 @@ enum KeptRecord {
 }
 
 /// Writes a recording on its own thread, so that no frame waits for a disk. The file is complete
-/// when the recorder is dropped. If the process is killed, about the last second is missing.
+/// when the recorder is dropped, unless the disk takes longer than [`PATIENCE`]. If the process is
+/// killed, about the last second is missing.
 pub(crate) struct SessionRecorder {
     /// `None` after a failure.
     to: Option<SyncSender<(Duration, KeptRecord)>>,
     waiting: Arc<AtomicUsize>,
     thread: Option<JoinHandle<()>>,
+    ended: Receiver<()>,
+    patience: Duration,
     path: PathBuf,
 }
 
@@ -116,28 +121,37 @@ struct RecordWriter {
     encoder: Encoder,
     waiting: Arc<AtomicUsize>,
     written: u64,
+    /// Largest recording, bytes before compression.
+    most: u64,
     flushed: Duration,
 }
 
 impl SessionRecorder {
     pub(crate) fn create(path: &Path) -> Result<Self, RecordingError> {
+        Self::limited(path, MAX_BYTES)
+    }
+
+    fn limited(path: &Path, most: u64) -> Result<Self, RecordingError> {
         let fail = |source| RecordingError::File { path: path.to_owned(), source };
         let mut file = File::create(path).map_err(fail)?;
         file.write_all(MAGIC).map_err(fail)?;
         let encoder = zstd::stream::write::Encoder::new(file, LEVEL).map_err(fail)?;
         let waiting = Arc::new(AtomicUsize::new(0));
         let (to, from) = mpsc::sync_channel(MAX_WAITING);
-        let mut writer =
-            RecordWriter { encoder, waiting: waiting.clone(), written: 0, flushed: Duration::ZERO };
+        let (end, ended) = mpsc::channel();
+        let flushed = Duration::ZERO;
+        let mut writer = RecordWriter { encoder, waiting: waiting.clone(), written: 0, most, flushed };
         let named = path.to_owned();
         let write = move || {
             if let Err(error) = writer.write_all(&from) {
                 // A failed recording must not end the session.
                 error!("{}: {error}; the recording ends here", named.display());
             }
+            drop(end);
         };
         let thread = std::thread::Builder::new().name("pliant-record".into()).spawn(write).map_err(fail)?;
-        Ok(Self { to: Some(to), waiting, thread: Some(thread), path: path.to_owned() })
+        let path = path.to_owned();
+        Ok(Self { to: Some(to), waiting, thread: Some(thread), ended, patience: PATIENCE, path })
     }
 
     pub(crate) fn put(&mut self, at: Duration, record: &SessionRecord) {
@@ -176,8 +190,9 @@ impl RecordWriter {
                 }
                 KeptRecord::Model(model) => SessionRecord::Model(model.to_bytes().into()),
             };
-            if self.written >= MAX_BYTES {
-                return Err(io::Error::other(format!("more than {MAX_BYTES} bytes")));
+            if self.written >= self.most {
+                self.encoder.do_finish()?;
+                return Err(io::Error::other(format!("more than {} bytes", self.most)));
             }
             self.written += write(&mut self.encoder, at, &record)?;
             if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
@@ -192,10 +207,14 @@ impl RecordWriter {
 impl Drop for SessionRecorder {
     fn drop(&mut self) {
         self.to = None;
-        if let Some(thread) = self.thread.take() {
-            // A panic of that thread has been reported there.
-            let _ = thread.join();
+        let Some(thread) = self.thread.take() else { return };
+        if self.ended.recv_timeout(self.patience) == Err(RecvTimeoutError::Timeout) {
+            let patience = self.patience.as_secs();
+            warn!("{}: the disk took more than {patience} s; the recording is given up", self.path.display());
+            return;
         }
+        // A panic of that thread has been reported there.
+        let _ = thread.join();
     }
 }
 
@@ -345,6 +364,54 @@ mod tests {
         }
         records.push((Duration::from_secs(20), SessionRecord::Closed(DisconnectReason::Left)));
         records
+    }
+
+    #[test]
+    fn a_recording_ends_at_its_limit_and_is_whole() {
+        let path = file("limited");
+        let records = records();
+        let mut recorder = SessionRecorder::limited(&path, 20_000).unwrap();
+        // All within a second, so that nothing was written out before the limit.
+        records.iter().for_each(|(_, record)| recorder.put(Duration::from_millis(1), record));
+        drop(recorder);
+        let mut recording = SessionRecording::open(&path).unwrap();
+        let played: Vec<_> = std::iter::from_fn(|| recording.poll(Duration::MAX)).collect();
+        let bytes: usize = played.iter().map(|(_, record)| 13 + record.len()).sum();
+        assert!((20_000..21_000).contains(&bytes), "{bytes} bytes in {} records", played.len());
+        assert!(played.iter().zip(&records).all(|(played, record)| played.1 == record.1));
+        std::fs::remove_file(&path).unwrap();
+    }
+
+    /// A pipe that nobody reads is a disk that stands still.
+    #[cfg(unix)]
+    #[test]
+    fn a_disk_that_stands_still_holds_up_no_frame_and_no_end() {
+        let path = file("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&path).status();
+        assert!(made.is_ok_and(|status| status.success()), "mkfifo");
+        let nobody = File::options().read(true).write(true).open(&path).unwrap();
+        let mut recorder = SessionRecorder::create(&path).unwrap();
+        recorder.patience = Duration::from_millis(100);
+        let began = std::time::Instant::now();
+        let (mut state, mut most) = (1_u64, 0);
+        for n in 0..20_000 {
+            // Bytes that do not compress, by xorshift (Marsaglia 2003).
+            let noise = (0..1000).map(|_| {
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                (state >> 24) as u8
+            });
+            recorder.put(Duration::from_millis(n), &SessionRecord::Datagram(noise.collect()));
+            most = most.max(recorder.waiting.load(Ordering::Relaxed));
+        }
+        assert!(recorder.to.is_none(), "the recording goes on");
+        assert!(most <= (MAX_WAITING + 1) * 1000, "{most} bytes wait");
+        drop(recorder);
+        assert!(began.elapsed() < Duration::from_secs(60), "{:?}", began.elapsed());
+        // The thread finds the pipe closed, and ends.
+        drop(nobody);
+        std::fs::remove_file(&path).unwrap();
     }
 
     #[test]
