@@ -53,6 +53,20 @@ fn step(host: &mut HostSession, now: Duration, tick: u64) {
     host.update(now);
 }
 
+#[test]
+fn changes_of_interest_make_few_encoders() {
+    let mut host = host();
+    // Another number of modes for each tick.
+    let wishes = ten_seconds(&mut host, |host, now, k| {
+        let modes = Some([1, 2, 3, 4, 6, 8, 12][k as usize % 7]);
+        host.on_message(now, PeerId(1), &GuestMessage::Interest { body: BODY.0, modes }.encode());
+    });
+    assert_eq!(wishes.len(), 10 * FRAMES as usize);
+    assert_eq!(host.users().count(), 1, "it is still there");
+    let made = host.encoders_made();
+    assert!(made <= 8, "{made} encoders for seven numbers of modes");
+}
+
 /// Calls `frame` for each frame of ten seconds, and returns the events of each frame.
 fn ten_seconds(
     host: &mut HostSession,

@@ -264,7 +264,18 @@ impl Encoder {
         self.last = tick;
     }
 
-    /// Returns true before the first [`Encoder::restart`].
+    /// Forgets what was sent, when nobody receives the stream any more. The patches of hands stay.
+    pub(crate) fn retire(&mut self) {
+        self.sent.clear();
+        self.started = None;
+    }
+
+    /// The last tick that was encoded.
+    pub(crate) fn last(&self) -> Tick {
+        self.last
+    }
+
+    /// Returns true before the first [`Encoder::restart`], and after [`Encoder::retire`].
     pub fn is_fresh(&self) -> bool {
         self.started.is_none()
     }

@@ -22,6 +22,10 @@ use crate::wire::{
     BodyInfo, Datagram, GuestMessage, HostMessage, MAX_NAME, PROTOCOL_VERSION, StreamSubscription,
 };
 
+/// Encoders of a body that are kept while nobody receives their stream. A guest that changes its
+/// wish again and again costs no new one each time, with the patches of all hands.
+const SPARE_ENCODERS: usize = 8;
+
 /// Key of an encoder: the subscription and the datagram size in bytes.
 pub(super) type StreamKey = (StreamSubscription, usize);
 
@@ -39,11 +43,25 @@ pub(super) struct HostBody {
     pub(super) reminded: Duration,
     /// The visible amplitudes of the modes, for the encoders.
     pub(super) visible: OnceLock<Vec<f64>>,
-    /// One encoder per subscription and datagram size.
+    /// One encoder per subscription and datagram size, with some that nobody receives any more.
     pub(super) streams: BTreeMap<StreamKey, Encoder>,
 }
 
 impl HostBody {
+    /// Retires the encoders of all streams but those in `keys`, and drops those that have been
+    /// retired for longest.
+    pub(super) fn retire_streams(&mut self, keys: &BTreeSet<StreamKey>) {
+        let mut spare: Vec<(Tick, StreamKey)> = Vec::new();
+        for (key, encoder) in self.streams.iter_mut().filter(|(key, _)| !keys.contains(key)) {
+            encoder.retire();
+            spare.push((encoder.last(), *key));
+        }
+        spare.sort_unstable();
+        for (_, key) in spare.iter().rev().skip(SPARE_ENCODERS) {
+            self.streams.remove(key);
+        }
+    }
+
     /// Describes the body to a guest; `None` before the guest has sent its subscription.
     pub(super) fn info(&self, guest: &GuestPeer) -> Option<BodyInfo> {
         Some(BodyInfo {
@@ -70,6 +88,7 @@ pub struct HostSession {
     next_user: u16,
     pub(super) upload: Upload,
     pub(super) encoded: u64,
+    pub(super) encoders_made: u64,
     /// Counts of the connections that have ended.
     gone: LinkStats,
 }
@@ -99,6 +118,7 @@ impl HostSession {
             next_user: 1,
             upload,
             encoded: 0,
+            encoders_made: 0,
             gone: LinkStats::default(),
         })
     }
@@ -460,6 +480,11 @@ impl HostSession {
         self.encoded
     }
 
+    /// Number of encoders made so far. Each one makes the patches of all hands on its body anew.
+    pub fn encoders_made(&self) -> u64 {
+        self.encoders_made
+    }
+
     pub(super) fn event(&mut self, event: HostEvent) {
         self.events.push(event);
     }
@@ -507,7 +532,7 @@ impl HostSession {
     pub(super) fn send_snapshot(&mut self, peer: PeerId, body: BodyId) {
         let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
         let Some(key) = stream_key(p, b) else { return };
-        if let Some(encoder) = b.streams.get(&key) {
+        if let Some(encoder) = b.streams.get(&key).filter(|encoder| !encoder.is_fresh()) {
             p.send_message(&HostMessage::Snapshot(encoder.snapshot(b.resting)), &mut self.out);
         }
     }

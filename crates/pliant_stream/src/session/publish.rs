@@ -71,7 +71,7 @@ impl HostSession {
                 takers.push((p.id, key, due));
             }
         }
-        entry.streams.retain(|key, _| keys.contains(key));
+        entry.retire_streams(&keys);
         let mut frames: BTreeMap<StreamKey, Outgoing> = BTreeMap::new();
         for key in keys {
             let encoder = match entry.streams.entry(key) {
@@ -90,7 +90,10 @@ impl HostSession {
                         visible,
                     );
                     match made {
-                        Ok(encoder) => e.insert(encoder.with_quantum(self.config.quantum)),
+                        Ok(encoder) => {
+                            self.encoders_made += 1;
+                            e.insert(encoder.with_quantum(self.config.quantum))
+                        }
                         Err(_) => continue,
                     }
                 }
