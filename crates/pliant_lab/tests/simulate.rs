@@ -41,7 +41,6 @@ fn run(from: u64, seeds: u64) -> SimulateReport {
     let report = simulate(&SimulateSettings { from, seeds, memory }, &mut ()).unwrap();
     println!("{report:#?}");
     assert!(report.failures.is_empty(), "{} of {seeds}", report.failures.len());
-    // Every kind of fault changed something, and the sessions went on.
     assert!(report.ticks > seeds * 1000, "{}", report.ticks);
     assert!(report.largest_memory.iter().all(|bytes| *bytes > 10_000), "{:?}", report.largest_memory);
     report
@@ -50,6 +49,7 @@ fn run(from: u64, seeds: u64) -> SimulateReport {
 #[test]
 fn fifty_sessions_under_faults_keep_what_must_hold() {
     let report = run(1, 50);
+    // Every kind of fault changed something.
     assert_eq!(report.faults.len(), FaultKind::ALL.len(), "{:?}", report.faults);
 }
 
@@ -60,10 +60,12 @@ fn a_seed_gives_the_same_session_again() {
     assert_ne!(first.digest, run(9, 2).digest, "and another seed another one");
 }
 
-/// Run by hand: a thousand seeds from `PLIANT_SIMULATE_FROM` (default 1000) on, with their memory.
+/// Run by hand: `PLIANT_SIMULATE_SEEDS` (default 1000) seeds from `PLIANT_SIMULATE_FROM` (default
+/// 1000) on, with their memory.
 #[test]
 #[ignore = "takes minutes"]
 fn a_thousand_sessions_under_faults_keep_what_must_hold() {
-    let from = std::env::var("PLIANT_SIMULATE_FROM").ok().and_then(|text| text.parse().ok());
-    run(from.unwrap_or(1000), 1000);
+    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse().ok());
+    let [from, seeds] = ["PLIANT_SIMULATE_FROM", "PLIANT_SIMULATE_SEEDS"].map(number);
+    run(from.unwrap_or(1000), seeds.unwrap_or(1000));
 }
