@@ -423,7 +423,10 @@ impl StreamedBody {
         }
         if stepped > 0 {
             self.fade_at = now + Duration::from_secs_f64(self.newmark.h);
-        } else if now >= self.fade_at && receiver.is_fading() && self.pauses(now) {
+        } else if now >= self.fade_at
+            && self.receiver.as_ref().is_some_and(Receiver::is_fading)
+            && self.pauses(now)
+        {
             // The schedule waits for a host that has paused. Corrections go on meanwhile.
             if let Some(receiver) = &mut self.receiver {
                 receiver.fade();
