@@ -6,7 +6,8 @@
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
 //! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
 //! second, until the host has the hand where this guest sent it. The same holds for a second after
-//! another's hand has come or gone. Where no frame comes at all, the reaction fades.
+//! another's hand has come or gone, and after news that has changed what the copy predicts by more
+//! than a twentieth of that measure. Where no frame comes at all, the reaction fades.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -24,6 +25,9 @@ const AFTER: Duration = Duration::from_secs(1);
 const PROLONGED: Duration = Duration::from_millis(250);
 /// How far a reaction may exceed the largest that the body gave.
 const BEYOND: f64 = 1.2;
+/// Change of a predicted reaction by news from the host that counts as a surprise, as a share of the
+/// largest reaction that the body gave.
+const SURPRISE: f64 = 0.05;
 /// Time constant with which a reaction fades where no frame comes, s.
 const FADE: f64 = 0.1;
 /// Time in which the whole reaction returns, s.
@@ -97,6 +101,19 @@ impl HitchGuard {
         }
     }
 
+    /// Bounds for a second, as [`HitchGuard::disturb`] does, where news from the host has changed
+    /// what the copy predicts by so many newtons: another's hand moves as no forecast can know.
+    pub(crate) fn surprise(&mut self, now: Duration, change: f64) {
+        if change > SURPRISE * self.most() {
+            self.disturb(now);
+        }
+    }
+
+    /// The largest reaction that the host has sent in the last second, N.
+    fn most(&self) -> f64 {
+        self.given.iter().map(|(_, given)| *given).fold(0.0, f64::max)
+    }
+
     /// Returns what a hand is told of a reaction, N.
     pub(crate) fn bound(&self, reaction: [f64; 3]) -> [f64; 3] {
         let reaction = Vector3::from(reaction) * self.share;
@@ -104,8 +121,7 @@ impl HitchGuard {
         if !bounded {
             return reaction.into();
         }
-        let most = self.given.iter().map(|(_, given)| *given).fold(0.0, f64::max);
-        reaction.cap_magnitude(BEYOND * most).into()
+        reaction.cap_magnitude(BEYOND * self.most()).into()
     }
 }
 
@@ -146,6 +162,21 @@ mod tests {
             guard.pass(tick as u32 * 25 * MS, Duration::ZERO);
         }
         guard.disturb(1500 * MS);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
+        (60..=101).for_each(|k| guard.pass(k * 25 * MS, Duration::ZERO));
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");
+    }
+
+    #[test]
+    fn a_prediction_that_news_change_is_bounded_for_a_second() {
+        let mut guard = HitchGuard::new(0.025);
+        for tick in 1..=60 {
+            guard.give(tick, 1.0);
+            guard.pass(tick as u32 * 25 * MS, Duration::ZERO);
+            guard.surprise(tick as u32 * 25 * MS, 0.049);
+        }
+        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "no surprise");
+        guard.surprise(1500 * MS, 0.051);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
         (60..=101).for_each(|k| guard.pass(k * 25 * MS, Duration::ZERO));
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");

@@ -66,6 +66,8 @@ pub struct PredictedHand {
     lead: usize,
     votes: u32,
     astray: bool,
+    /// Largest change of a reaction by new information in the last step, N.
+    surprise: f64,
     tick: Tick,
     active: bool,
     copy: BodyCopy,
@@ -94,6 +96,7 @@ impl PredictedHand {
             lead: 0,
             votes: 0,
             astray: false,
+            surprise: 0.0,
             tick: 0,
             active: false,
             copy: BodyCopy::new(rest.clone()),
@@ -182,6 +185,11 @@ impl PredictedHand {
     /// confirmed tick: it leads the hand back after a hitch, or has lost targets.
     pub(crate) fn is_astray(&self) -> bool {
         self.astray
+    }
+
+    /// Largest change of a reaction of the guest's own hands by what the last frames told, N.
+    pub(crate) fn surprise(&self) -> f64 {
+        self.surprise
     }
 
     /// Returns false when the guest does not hold the body and no offset fades. The confirmed state
@@ -282,8 +290,11 @@ impl PredictedHand {
         self.visual.advance();
         self.visual.add(model, &expected.state, &copy.state);
         self.visual.show(model, &copy.state);
+        self.surprise = 0.0;
         for g in &mut self.grabs {
             g.take_reaction(&copy, user);
+            let change = (Vector3::from(g.would) - Vector3::from(g.reaction)).norm();
+            self.surprise = self.surprise.max(change);
             for ((offset, would), now) in g.offset.iter_mut().zip(g.would).zip(g.reaction) {
                 *offset = self.fade * (*offset + would - now);
             }

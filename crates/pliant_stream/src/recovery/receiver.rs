@@ -60,6 +60,22 @@ pub struct RepairCounts {
     pub mismatches: u64,
 }
 
+impl std::ops::Add for RepairCounts {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            stepped: self.stepped + other.stepped,
+            in_time: self.in_time + other.in_time,
+            guessed: self.guessed + other.guessed,
+            repaired: self.repaired + other.repaired,
+            too_late: self.too_late + other.too_late,
+            snapshots: self.snapshots + other.snapshots,
+            mismatches: self.mismatches + other.mismatches,
+        }
+    }
+}
+
 /// A body at a receiver.
 pub struct Receiver {
     settings: StepSettings,

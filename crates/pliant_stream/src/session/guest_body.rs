@@ -22,9 +22,6 @@ const MAX_REQUESTS: u8 = 12;
 const REQUEST_WITHIN: u64 = 200;
 /// Backlog beyond which the receiver does not catch up tick by tick, ticks. A snapshot is faster.
 const CATCH_UP: u64 = 120;
-/// A snapshot of a later tick waits until that tick is shown, at most this many ticks. One from
-/// further ahead is faster than the ticks up to it.
-const WAIT_FOR_TICK: u64 = 40;
 /// Silence after which the host may have paused.
 const QUIET: Duration = Duration::from_millis(100);
 
@@ -44,6 +41,8 @@ pub struct StreamedBody {
     pub(crate) interest: Option<u16>,
     pub(crate) model: Option<Arc<ModalModel>>,
     pub(crate) receiver: Option<Receiver>,
+    /// The counts of former receivers.
+    counted: RepairCounts,
     pub(crate) playout: PlayoutClock,
     pub(crate) predicted: Option<PredictedHand>,
     predicts: bool,
@@ -82,6 +81,7 @@ impl StreamedBody {
             interest: None,
             model: None,
             receiver: None,
+            counted: RepairCounts::default(),
             playout: PlayoutClock::new(newmark.h, config.playout),
             predicted: None,
             predicts,
@@ -204,9 +204,10 @@ impl StreamedBody {
         self.receiver.as_ref().and_then(Receiver::pose)
     }
 
-    /// Counts of stepped, guessed and repaired ticks.
+    /// Counts of stepped, guessed and repaired ticks since the body is here, also of what was
+    /// received with another number of modes.
     pub fn counts(&self) -> RepairCounts {
-        self.receiver.as_ref().map(Receiver::counts).unwrap_or_default()
+        self.counted + self.receiver.as_ref().map(Receiver::counts).unwrap_or_default()
     }
 
     /// Returns whether the host reports that the body sleeps.
@@ -253,16 +254,17 @@ impl StreamedBody {
             && !retuned
         {
             // At once, a snapshot of a later tick would move the shown shape by the way of the body
-            // until then.
+            // until then. It waits until its tick is shown.
             let ahead = snapshot.tick.saturating_sub(receiver.tick());
             self.snapshot = Some(snapshot);
-            if self.resting || !(1..=WAIT_FOR_TICK).contains(&ahead) {
+            if self.resting || !(1..=CATCH_UP).contains(&ahead) {
                 self.resync();
             }
             return false;
         }
         // The receiver is rebuilt for another number of modes or other step settings.
         self.resolved = self.resolved.max(snapshot.tick);
+        self.counted = self.counts();
         let again = self.receiver.take().is_some();
         self.snapshot = Some(snapshot);
         let ready = self.begin();
@@ -419,6 +421,7 @@ impl StreamedBody {
                 if predicted.is_astray() {
                     self.hitches.prolong(now);
                 }
+                self.hitches.surprise(now, predicted.surprise());
             }
         }
         if stepped > 0 {
