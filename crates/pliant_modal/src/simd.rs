@@ -25,6 +25,41 @@ pub(crate) fn dot(row: &[f64], x: &[f64]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
 }
 
+/// Work of plain loops that the compiler vectorizes. [`Work::run`] has to be inlined always.
+pub(crate) trait Work {
+    type Out;
+    fn run(self) -> Self::Out;
+}
+
+/// Does work in the widest registers of the processor. The result is the same in all of them,
+/// because the compiler neither fuses nor reorders operations.
+pub(crate) fn widest<W: Work>(work: W) -> W::Out {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("fma") {
+            // SAFETY: The check above found AVX-512F and FMA.
+            return unsafe { with_avx512(work) };
+        }
+        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
+            // SAFETY: The check above found AVX2 and FMA.
+            return unsafe { with_avx2(work) };
+        }
+    }
+    work.run()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,fma")]
+fn with_avx512<W: Work>(work: W) -> W::Out {
+    work.run()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,fma")]
+fn with_avx2<W: Work>(work: W) -> W::Out {
+    work.run()
+}
+
 /// [`BLOCK`] numbers in one register, two registers or an array.
 ///
 /// # Safety

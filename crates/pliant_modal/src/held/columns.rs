@@ -27,11 +27,18 @@ const CORRECTION: f64 = 1e-8;
 /// Largest energy density of a training shape, as a share of Young's modulus.
 const ENERGY: f64 = 0.02;
 
-/// Ways of a hand in the shapes that are corrected, as shares of the body's size.
-const WAYS: [f64; 4] = [0.04, 0.08, 0.16, 0.3];
+/// Ways of a hand in training shapes, as shares of the body's size.
+const WAYS: [f64; 4] = [0.04, 0.1, 0.2, 0.4];
 
 /// Number of points, outside and inside the region, that find the shapes that are corrected.
-const POINTS: [usize; 2] = [300, 600];
+const POINTS: [usize; 2] = [200, 400];
+
+/// Number of points, outside and inside the region, that find the same shapes with the columns that
+/// correct them.
+const COARSE: [usize; 2] = [150, 300];
+
+/// Number of Newton rounds that find a shape anew with more columns.
+const AGAIN: usize = 2;
 
 /// Number of points outside of which those are taken.
 const OUTSIDE: usize = 2_000;
@@ -93,21 +100,21 @@ impl Columns {
 
     /// Adds columns that correct shapes in which the hands pull far: the displacements by which a
     /// Newton step changes them, less what the columns and the coordinates have of them. The
-    /// corrections with the largest shares of the energy are kept.
+    /// corrections with the largest shares of the energy are kept. Returns the columns and the
+    /// shapes, each with the index of its patch.
     pub(super) fn corrected(
         self,
         model: &ModalModel,
         region: &Region<'_>,
         loads: &[Load],
         law: Hyperelastic,
-    ) -> Option<Self> {
-        let inside = region.inside(&self);
-        let outside = region.outside(model.size(), OUTSIDE, &self);
-        let points: Vec<Point> =
-            thinned(&outside, POINTS[0]).into_iter().chain(thinned(&inside, POINTS[1])).collect();
+    ) -> Option<(Self, Vec<(usize, GuidedShape)>)> {
+        let outside = thinned(&region.outside(model.size(), OUTSIDE), POINTS[0]);
+        let places = [outside, thinned(&region.inside(), POINTS[1])].concat();
+        let points = region.points(&places, &self, &region.node_rows(&self));
         let patches = self.rows(region, loads);
         let omega = self.omega(model);
-        let guided = guided(model, law, &omega, &points, &patches, &WAYS)?;
+        let guided = guided(model, law, &omega, &points, &patches)?;
         let mut blocks = Vec::new();
         for (index, load) in loads.iter().enumerate() {
             let own: Vec<&GuidedShape> =
@@ -116,16 +123,7 @@ impl Columns {
             if cases == 0 {
                 continue;
             }
-            let forces: Vec<Vector3<f64>> = own.iter().map(|shape| shape.force).collect();
-            let mut given = vec![0.0; 3 * region.node_count() * cases];
-            for (case, shape) in own.iter().enumerate() {
-                let (s, q) = shape.q.split_at(self.width);
-                let mut q = q.to_vec();
-                self.less_part(s, &mut q);
-                let u = region.displacements(&q, &self.values, s);
-                given.iter_mut().skip(case).step_by(cases).zip(u).for_each(|(to, u)| *to = u);
-            }
-            let mut found = region.corrections(index, load, &forces, &given, law);
+            let mut found = region.corrections(index, load, &own, &self, law);
             // What matters is the share of a shape's energy that is corrected.
             let scales: Vec<f64> = own
                 .iter()
@@ -139,7 +137,7 @@ impl Columns {
         }
         let width = blocks.iter().map(|(_, cases)| cases).sum();
         if width == 0 {
-            return Some(self);
+            return Some((self, guided));
         }
         let mut values: Vec<f64> = Vec::with_capacity(3 * region.node_count() * width);
         for row in 0..3 * region.node_count() {
@@ -148,23 +146,40 @@ impl Columns {
             }
         }
         if !values.iter().all(|x| x.is_finite()) {
-            return Some(self);
+            return Some((self, guided));
         }
         let most = if loads.len() == 1 { MAX_CORRECTIONS[0] } else { MAX_CORRECTIONS[1] };
         let energies = region.energies([&values, &values], [width; 2]);
         let corrections = Self { values, width, parts: Vec::new() };
         let Some(new) = corrections.beside(model, region, &energies, CORRECTION, most, Some(&self)) else {
-            return Some(self);
+            return Some((self, guided));
         };
         let joined = |a: &[f64], b: &[f64]| -> Vec<f64> {
             let rows = a.chunks_exact(self.width).zip(b.chunks_exact(new.width));
             rows.flat_map(|(a, b)| a.iter().chain(b).copied()).collect()
         };
-        Some(Self {
+        let all = Self {
             values: joined(&self.values, &new.values),
             parts: joined(&self.parts, &new.parts),
             width: self.width + new.width,
-        })
+        };
+        let mut guided = guided;
+        for (_, shape) in &mut guided {
+            shape.q.splice(self.width..self.width, std::iter::repeat_n(0.0, new.width));
+        }
+        let (inside, outside) = (region.inside(), region.outside(model.size(), OUTSIDE));
+        let places = [thinned(&outside, COARSE[0]), thinned(&inside, COARSE[1])].concat();
+        let points = region.points(&places, &all, &region.node_rows(&all));
+        let (omega, patches) = (all.omega(model), all.rows(region, loads));
+        let (mut energy, most) = coarse(model, law, &omega, &points)?;
+        let again = |(patch, shape): (usize, GuidedShape)| {
+            let found =
+                cubature::hold(&mut energy, &omega, patches.get(patch)?, &shape.there, &shape.q, AGAIN)?;
+            let reached = energy.energy(&found.q);
+            (reached <= most).then_some((patch, found))
+        };
+        let found = guided.into_iter().filter_map(again).collect();
+        Some((all, found))
     }
 
     /// Takes the part of the coordinates, and of `others`, out of columns with given energies.
@@ -223,7 +238,7 @@ impl Columns {
     }
 
     /// Computes `q - P s`.
-    fn less_part(&self, s: &[f64], q: &mut [f64]) {
+    pub(super) fn less_part(&self, s: &[f64], q: &mut [f64]) {
         for (q, row) in q.iter_mut().zip(self.parts.chunks_exact(self.width)) {
             *q -= row.iter().zip(s).map(|(part, s)| part * s).sum::<f64>();
         }
@@ -245,25 +260,35 @@ impl Columns {
     }
 }
 
-/// Finds the shapes in which each patch is led along the axes by the given ways (shares of the
-/// size), with the energy of some points. Returns them with the indices of their patches.
-pub(super) fn guided(
+/// The energy of some points, and the most that a training shape may have of it, J.
+fn coarse(
     model: &ModalModel,
     law: Hyperelastic,
     omega: &[f64],
     points: &[Point],
-    patches: &[Rows],
-    ways: &[f64],
-) -> Option<Vec<(usize, GuidedShape)>> {
+) -> Option<(ElasticEnergy, f64)> {
     let few = ReducedElasticity {
         material: model.material()?,
         weights: points.iter().map(|point| point.weight).collect(),
         gradients: points.iter().flat_map(|point| point.gradients.iter().map(|&x| x as f32)).collect(),
         mesh: None,
     };
-    let mut energy = ElasticEnergy::new(&few, law, omega).ok()?;
+    let energy = ElasticEnergy::new(&few, law, omega).ok()?;
     let most = ENERGY * model.info().young * energy.volume();
-    let ways: Vec<f64> = ways.iter().map(|way| way * model.size()).collect();
+    Some((energy, most))
+}
+
+/// Finds the shapes in which each patch is led along the axes, with the energy of some points.
+/// Returns them with the indices of their patches.
+fn guided(
+    model: &ModalModel,
+    law: Hyperelastic,
+    omega: &[f64],
+    points: &[Point],
+    patches: &[Rows],
+) -> Option<Vec<(usize, GuidedShape)>> {
+    let (mut energy, most) = coarse(model, law, omega, points)?;
+    let ways = WAYS.map(|way| way * model.size());
     let mut out = Vec::new();
     for (index, patch) in patches.iter().enumerate() {
         for direction in &DIRECTIONS {

@@ -137,6 +137,11 @@ impl SimulationMesh {
         self.stiffness.get(tet as usize).map_or(1.0, |&factor| f64::from(factor))
     }
 
+    /// Number of nodes.
+    pub(super) fn node_count(&self) -> usize {
+        self.displacements.len() / (3 * self.scales.len()).max(1)
+    }
+
     /// Whether a node is anchored: no coordinate moves it.
     pub(super) fn is_anchored(&self, node: u32) -> bool {
         let modes = self.scales.len();

@@ -23,8 +23,10 @@
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 
 mod columns;
+mod elastic;
 mod mesh;
 mod region;
+mod stiffness;
 
 use std::sync::Arc;
 
@@ -33,15 +35,14 @@ use nalgebra::{Matrix3, Vector3};
 pub use mesh::{SimulationMesh, VertexPlace};
 
 use self::{
-    columns::{Columns, guided},
-    region::{Load, Region},
+    columns::Columns,
+    region::{Load, Place, Region},
 };
 use crate::{
     HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, StepError,
-    cubature::{self, Fit, Point},
+    cubature::{self, Fit, GuidedShape, Point},
     nonlinear::Gradients,
     step::{contact_floor, residual},
-    tetrahedron,
 };
 
 /// Number of points outside of the region to choose from.
@@ -54,17 +55,11 @@ const REFERENCE: usize = 24_000;
 /// Number of points inside the region to choose from.
 const INSIDE: usize = 4_000;
 
-/// Number of points, outside and inside, that find the training shapes.
-const COARSE: [usize; 2] = [150, 300];
-
 /// Largest number of points of a rule, by coordinate.
-const POINTS_PER_COORDINATE: usize = 4;
+const POINTS_PER_COORDINATE: usize = 3;
 
 /// Error of the forces over the training shapes at which no more points are added.
 const TOLERANCE: f64 = 3e-3;
-
-/// Ways of a hand in the training shapes, as shares of the body's size.
-const WAYS: [f64; 4] = [0.04, 0.12, 0.25, 0.5];
 
 /// What identifies a patch of a model: its center and its radius.
 pub(crate) type PatchKey = (u32, u64);
@@ -135,7 +130,7 @@ impl HeldShapes {
         let loads: Vec<Load> = patches.iter().map(|patch| region.load(patch)).collect();
         let columns = Columns::new(model, &region, &loads, law)
             .and_then(|columns| columns.corrected(model, &region, &loads, law));
-        let Some(columns) = columns else { return Ok(None) };
+        let Some((columns, shapes)) = columns else { return Ok(None) };
         let width = columns.width;
         let whole = columns.rows(&region, &loads);
         if !whole.iter().flatten().flatten().all(|x| x.is_finite()) {
@@ -145,7 +140,7 @@ impl HeldShapes {
         let rows: Vec<cubature::Rows> = whole.iter().map(own).collect();
         let residuals = patches.iter().zip(&rows).map(|(patch, own)| left_over(model, patch, own));
         let residuals = residuals.collect::<Result<Vec<_>, _>>()?;
-        let Some(rule) = rule(model, &region, law, &columns, &whole) else { return Ok(None) };
+        let Some(rule) = rule(model, &region, law, &columns, &shapes) else { return Ok(None) };
         let omega = columns.omega(model);
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
         let mut at = vec![0.0; 3 * width];
@@ -284,34 +279,19 @@ fn left_over(model: &ModalModel, patch: &Patch, own: &cubature::Rows) -> Result<
     Ok(eigen.eigenvectors * kept * eigen.eigenvectors.transpose())
 }
 
-/// Makes the rule of columns and coordinates. `patches` has the mean displacements of the patches
-/// by both. Returns `None` if no shape can be found.
+/// Makes the rule of columns and coordinates, from training shapes. Returns `None` without any.
 fn rule(
     model: &ModalModel,
     region: &Region<'_>,
     law: Hyperelastic,
     columns: &Columns,
-    patches: &[cubature::Rows],
+    shapes: &[(usize, GuidedShape)],
 ) -> Option<Vec<Point>> {
     let omega = columns.omega(model);
     let m = omega.len();
-    let inside = region.inside(columns);
-    let reference = region.outside(model.size(), REFERENCE, columns);
-    let candidates: Vec<Point> =
-        thinned(&reference, OUTSIDE).into_iter().chain(thinned(&inside, INSIDE)).collect();
-    let coarse: Vec<Point> =
-        thinned(&reference, COARSE[0]).into_iter().chain(thinned(&inside, COARSE[1])).collect();
-    let shapes = guided(model, law, &omega, &coarse, patches, &WAYS)?;
-    let shapes: Vec<Vec<f64>> = shapes.into_iter().map(|(_, shape)| shape.q).collect();
-    let whole = || reference.iter().chain(&inside);
-    let forces: Vec<Vec<f64>> = shapes
-        .iter()
-        .map(|q| {
-            let mut sum = vec![0.0; m];
-            whole().for_each(|point| point.add_force(law, q, &mut sum));
-            sum
-        })
-        .collect();
+    let outside = region.outside(model.size(), REFERENCE);
+    let shapes: Vec<Vec<f64>> = shapes.iter().map(|(_, shape)| shape.q.clone()).collect();
+    let forces = region.forces(columns, &shapes, law, &outside);
     // Columns and coordinates are orthogonal to each other in the stiffness at rest.
     let mut stiffness = vec![0.0; m * m];
     omega.iter().enumerate().for_each(|(i, omega)| stiffness[i * m + i] = omega * omega);
@@ -324,6 +304,8 @@ fn rule(
         tolerance: TOLERANCE,
         most: POINTS_PER_COORDINATE * m,
     };
+    let places = [thinned(&outside, OUTSIDE), thinned(&region.inside(), INSIDE)].concat();
+    let candidates = region.points(&places, columns, &region.node_rows(columns));
     let chosen = cubature::choose(&candidates, &fit);
     let point = |(index, factor): (usize, f64)| {
         let point = &candidates[index];
@@ -335,64 +317,13 @@ fn rule(
 }
 
 /// Returns about `most` of the points, evenly from the list, with weights whose sum stays.
-fn thinned(points: &[Point], most: usize) -> Vec<Point> {
-    let stride = points.len().div_ceil(most).max(1);
-    let groups = points.chunks(stride).enumerate();
+fn thinned(places: &[Place], most: usize) -> Vec<Place> {
+    let stride = places.len().div_ceil(most).max(1);
+    let groups = places.chunks(stride).enumerate();
     groups
         .map(|(group, members)| {
-            let weight = members.iter().map(|point| point.weight).sum();
-            let gradients = members[(group * 7919) % members.len()].gradients.clone();
-            Point { weight, gradients }
+            let weight = members.iter().map(|place| place.weight).sum();
+            Place { weight, ..members[(group * 7919) % members.len()] }
         })
         .collect()
-}
-
-impl Region<'_> {
-    /// A quadrature point of an element.
-    fn point(&self, element: u32, point: usize, weight: f64, columns: &Columns) -> Point {
-        let mut gradients = self.gradients(element, point, &columns.values, columns.width);
-        let all = gradients.len() / 9;
-        for row in gradients.chunks_exact_mut(all) {
-            let (own, modal) = row.split_at_mut(columns.width);
-            columns.take_out(modal, own);
-        }
-        Point { weight, gradients }
-    }
-
-    /// All quadrature points of the region's elements.
-    fn inside(&self, columns: &Columns) -> Vec<Point> {
-        let points = tetrahedron::stiffness_points(self.kind()).0.len();
-        let make = |&element: &u32| {
-            let (_, volume) = self.place(element);
-            let weight = volume / points as f64;
-            (0..points).map(move |point| self.point(element, point, weight, columns))
-        };
-        self.elements.iter().flat_map(make).collect()
-    }
-
-    /// At most about `most` quadrature points outside of the region, spread over the body, with
-    /// weights whose sum is the volume there.
-    fn outside(&self, size: f64, most: usize, columns: &Columns) -> Vec<Point> {
-        let mut order: Vec<((i64, [i64; 3]), u32, f64)> = (0..self.mesh_elements() as u32)
-            .filter(|element| self.elements.binary_search(element).is_err())
-            .map(|element| {
-                let (center, volume) = self.place(element);
-                // Elements in the order of a coarse grid lie beside each other.
-                let cell: [i64; 3] = std::array::from_fn(|k| (16.0 * center[k] / size).floor() as i64);
-                ((self.octave(element), cell), element, volume)
-            })
-            .collect();
-        order.sort_by_key(|&(cell, element, _)| (cell, element));
-        let points = tetrahedron::stiffness_points(self.kind()).0.len();
-        let stride = (order.len() * points).div_ceil(most).max(1);
-        let groups = order.chunks(stride).enumerate();
-        groups
-            .flat_map(|(group, members)| {
-                // All points of one element of each group, for the volume of the group.
-                let weight = members.iter().map(|(_, _, volume)| volume).sum::<f64>() / points as f64;
-                let (_, element, _) = members[(group * 7919) % members.len()];
-                (0..points).map(move |point| self.point(element, point, weight, columns))
-            })
-            .collect()
-    }
 }

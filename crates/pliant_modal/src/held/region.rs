@@ -2,10 +2,17 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::mesh::SimulationMesh;
+use super::{
+    columns::Columns,
+    elastic::{AddGradients, Amplitudes, Elastic, Generalized, Sample},
+    mesh::SimulationMesh,
+    stiffness::{Stiffness, field, write, zeros},
+};
 use crate::{
     Element, Hyperelastic, Patch,
-    cubature::Rows,
+    cubature::{GuidedShape, Point, Rows},
+    nonlinear::{LANES, Lane},
+    simd::widest,
     tetrahedron::{self, Affine, MAX_NODES},
 };
 
@@ -21,17 +28,25 @@ const MAX_ELEMENTS: usize = 2_000;
 
 /// Residual of the static shapes, in the norm of the energy, at which the iteration ends. The
 /// shapes are a basis, so that they need not be exact.
-const TOLERANCE: f64 = 1e-3;
+const STATIC: f64 = 1e-3;
 
-/// Maximum number of iterations for the static shapes.
-const MAX_ITERATIONS: usize = 100;
+/// The same for the corrections of shapes.
+const CORRECTED: f64 = 1e-2;
+
+/// A quadrature point of an element of the mesh with its weight, m^3.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    pub(super) element: u32,
+    pub(super) point: usize,
+    pub(super) weight: f64,
+}
 
 /// Elements of the simulation mesh around some patches.
 pub(super) struct Region<'a> {
     mesh: &'a SimulationMesh,
     kind: Element,
     /// Numbers of the elements in the mesh, ascending.
-    pub(super) elements: Vec<u32>,
+    elements: Vec<u32>,
     /// Region's nodes of each of these elements.
     nodes: Vec<[u32; MAX_NODES]>,
     affine: Vec<Affine>,
@@ -137,19 +152,14 @@ impl<'a> Region<'a> {
         self.numbers.len()
     }
 
-    /// Number of elements of the whole mesh.
-    pub(super) fn mesh_elements(&self) -> usize {
-        self.mesh.tets.len()
-    }
-
     /// Octave of the moduli of an element of the mesh. Only elements of one octave may stand for
     /// each other.
-    pub(super) fn octave(&self, element: u32) -> i64 {
+    fn octave(&self, element: u32) -> i64 {
         self.mesh.stiffness(element).log2().round() as i64
     }
 
     /// Center of an element of the mesh, m, and its volume times the factor of its moduli, m^3.
-    pub(super) fn place(&self, element: u32) -> (Vector3<f64>, f64) {
+    fn place(&self, element: u32) -> (Vector3<f64>, f64) {
         let corners = self.mesh.tets[element as usize].map(|c| self.mesh.corners[c as usize].map(f64::from));
         let center = corners.iter().map(|&c| Vector3::from(c)).sum::<Vector3<f64>>() * 0.25;
         (center, Affine::new(corners).volume * self.mesh.stiffness(element))
@@ -190,11 +200,6 @@ impl<'a> Region<'a> {
             }
         }
         (own, modal)
-    }
-
-    /// The kind of the elements.
-    pub(super) fn kind(&self) -> Element {
-        self.kind
     }
 
     /// Calls `visit` with the nodes of the mesh that move a surface vertex, and their shares.
@@ -246,9 +251,14 @@ impl<'a> Region<'a> {
             }
         }
         let free = &self.free[index];
-        self.stiffness.solve(free, &mut first, 3);
+        let solve = |values: &mut [f64], width: usize| {
+            let mut forces = field(values, width, 0);
+            self.stiffness.solve(free, &mut forces, STATIC);
+            write(&forces, width, 0, values);
+        };
+        solve(&mut first, 3);
         let mut second = self.second_order_forces(&first, law);
-        self.stiffness.solve(free, &mut second, 6);
+        solve(&mut second, 6);
         let mut out = Vec::with_capacity(27 * nodes);
         for (a, b) in first.chunks_exact(3).zip(second.chunks_exact(6)) {
             out.extend(a);
@@ -257,55 +267,116 @@ impl<'a> Region<'a> {
         out
     }
 
-    /// Displacements by which a Newton step with the stiffness at rest corrects given displacements
-    /// of the region, where a force (N) acts on the load of the patch with this index. `given` and
-    /// the result are `[node][axis][case]`.
+    /// Displacements by which a Newton step with the stiffness at rest corrects shapes in which the
+    /// patch with this index is held. The shapes are those of columns and coordinates; the result
+    /// is `[node][axis][shape]`.
     pub(super) fn corrections(
         &self,
         index: usize,
         load: &Load,
-        forces: &[Vector3<f64>],
-        given: &[f64],
+        shapes: &[&GuidedShape],
+        columns: &Columns,
         law: Hyperelastic,
     ) -> Vec<f64> {
-        let cases = forces.len();
-        let mut out = vec![0.0; given.len()];
-        for &(node, share) in load {
-            let Ok(at) = self.numbers.binary_search(&node) else { continue };
-            for (axis, out) in out[3 * at * cases..][..3 * cases].chunks_exact_mut(cases).enumerate() {
-                out.iter_mut().zip(forces).for_each(|(out, force)| *out += share * force[axis]);
-            }
-        }
-        let mut u = vec![0.0; 3 * self.node_count()];
-        for case in 0..cases {
-            u.iter_mut().zip(given.iter().skip(case).step_by(cases)).for_each(|(u, given)| *u = *given);
-            for element in 0..self.elements.len() {
-                self.at_points(element, &u, &mut [Matrix3::zeros()], |weight, nodes, g, [h]| {
-                    let stress = weight * law.stress(h);
-                    for (&node, g) in nodes.iter().zip(g) {
-                        let force = stress * g;
-                        let at = 3 * node as usize;
-                        (0..3).for_each(|axis| out[(at + axis) * cases + case] -= force[axis]);
+        let nodes = self.node_count();
+        let mut out = vec![0.0; 3 * nodes * shapes.len()];
+        let elements: Vec<Sample> = self
+            .nodes
+            .iter()
+            .zip(&self.affine)
+            .map(|(nodes, affine)| Sample { nodes: *nodes, affine: *affine, share: 1.0 })
+            .collect();
+        let numbers: Vec<(u32, Option<u32>)> =
+            self.numbers.iter().zip(0..).map(|(&node, own)| (node, Some(own))).collect();
+        for (group, shapes_of) in shapes.chunks(LANES).enumerate() {
+            let at = Amplitudes::new(shapes_of.iter().map(|shape| &shape.q[..]), columns);
+            let mut forces = zeros(nodes);
+            widest(Elastic {
+                mesh: self.mesh,
+                kind: self.kind,
+                law,
+                columns,
+                at: &at,
+                nodes: &numbers,
+                elements: &elements,
+                out: &mut forces,
+            });
+            forces.iter_mut().flatten().for_each(|lane| *lane = -*lane);
+            for &(node, share) in load {
+                let Ok(at) = self.numbers.binary_search(&node) else { continue };
+                for (axis, out) in forces[at].iter_mut().enumerate() {
+                    for (out, shape) in out.0.iter_mut().zip(shapes_of) {
+                        *out += share * shape.force[axis];
                     }
-                });
+                }
             }
+            self.stiffness.solve(&self.free[index], &mut forces, CORRECTED);
+            write(&forces, shapes.len(), group * LANES, &mut out);
         }
-        self.stiffness.solve(&self.free[index], &mut out, cases);
         out
     }
 
-    /// Displacements of the region's nodes by the coordinates and columns, `[node][axis]`, m.
-    pub(super) fn displacements(&self, q: &[f64], columns: &[f64], s: &[f64]) -> Vec<f64> {
-        let (modes, width) = (self.mesh.scales.len(), s.len());
-        let mut phi = vec![0.0; 3 * modes];
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let mut out = Vec::with_capacity(3 * self.node_count());
-        for (&node, columns) in self.numbers.iter().zip(columns.chunks_exact(3 * width)) {
-            self.mesh.coordinates(node, &mut phi);
-            let rows = phi.chunks_exact(modes).zip(columns.chunks_exact(width));
-            out.extend(rows.map(|(phi, column)| dot(phi, q) + dot(column, s)));
+    /// The elastic forces of the body on columns and coordinates in given shapes: those of the
+    /// region, and of at most about `most` quadrature points outside of it.
+    pub(super) fn forces(
+        &self,
+        columns: &Columns,
+        shapes: &[Vec<f64>],
+        law: Hyperelastic,
+        outside: &[Place],
+    ) -> Vec<Vec<f64>> {
+        let per = self.kind.node_count();
+        let points = tetrahedron::stiffness_points(self.kind).0.len() as f64;
+        let of = |e: u32| &self.connectivity[e as usize * per..][..per];
+        let inside = self.elements.iter().map(|&element| (element, None));
+        let outside = outside.iter().filter(|place| place.point == 0);
+        let outside = outside.map(|place| (place.element, Some(points * place.weight)));
+        let sampled: Vec<(u32, Option<f64>)> = inside.chain(outside).collect();
+        // The nodes of these elements have numbers of their own.
+        let mut local = vec![u32::MAX; self.mesh.node_count()];
+        sampled.iter().flat_map(|&(e, _)| of(e)).for_each(|&node| local[node as usize] = 0);
+        let mut nodes: Vec<(u32, Option<u32>)> = Vec::new();
+        for (node, local) in local.iter_mut().enumerate().filter(|(_, local)| **local == 0) {
+            *local = nodes.len() as u32;
+            let own = self.numbers.binary_search(&(node as u32)).ok();
+            nodes.push((node as u32, own.map(|own| own as u32)));
+        }
+        let elements: Vec<Sample> = sampled
+            .iter()
+            .map(|&(element, volume)| {
+                let mut nodes = [0; MAX_NODES];
+                nodes.iter_mut().zip(of(element)).for_each(|(n, &node)| *n = local[node as usize]);
+                let affine = self.affine_of(element);
+                Sample { nodes, affine, share: volume.map_or(1.0, |volume| volume / affine.volume) }
+            })
+            .collect();
+        let all = columns.width + self.mesh.scales.len();
+        let mut out = Vec::with_capacity(shapes.len());
+        for shapes in shapes.chunks(LANES) {
+            let at = Amplitudes::new(shapes.iter().map(|q| &q[..]), columns);
+            let mut forces = zeros(nodes.len());
+            widest(Elastic {
+                mesh: self.mesh,
+                kind: self.kind,
+                law,
+                columns,
+                at: &at,
+                nodes: &nodes,
+                elements: &elements,
+                out: &mut forces,
+            });
+            let mut sums = vec![Lane::splat(0.0); all];
+            widest(Generalized { mesh: self.mesh, columns, nodes: &nodes, forces: &forces, out: &mut sums });
+            out.extend((0..shapes.len()).map(|lane| sums.iter().map(|sum| sum.0[lane]).collect()));
         }
         out
+    }
+
+    /// All energies are linear in the moduli, so their factor goes into the volume.
+    fn affine_of(&self, element: u32) -> Affine {
+        let corners = self.mesh.tets[element as usize].map(|c| self.mesh.corners[c as usize].map(f64::from));
+        let affine = Affine::new(corners);
+        Affine { volume: affine.volume * self.mesh.stiffness(element), ..affine }
     }
 
     /// The nodal forces of second order of the pairs of three shapes.
@@ -386,177 +457,96 @@ impl<'a> Region<'a> {
         out
     }
 
-    /// Gradients of the columns and of the coordinates after them at a quadrature point of an
-    /// element of the mesh, as in [`Point`](crate::cubature::Point).
-    pub(super) fn gradients(&self, element: u32, point: usize, columns: &[f64], width: usize) -> Vec<f64> {
-        let (modes, per) = (self.mesh.scales.len(), self.kind.node_count());
-        let all = modes + width;
-        let corners = self.mesh.tets[element as usize].map(|c| self.mesh.corners[c as usize].map(f64::from));
-        let (points, _) = tetrahedron::stiffness_points(self.kind);
-        let g = Affine::new(corners).shape_gradients(self.kind, points[point % points.len()]);
-        let nodes = &self.connectivity[element as usize * per..][..per];
-        let (mut out, mut phi) = (vec![0.0; 9 * all], vec![0.0; 3 * modes]);
-        let inside = self.elements.binary_search(&element).is_ok();
-        for (&node, g) in nodes.iter().zip(&g) {
-            self.mesh.coordinates(node, &mut phi);
-            let own = if inside { self.numbers.binary_search(&node).ok() } else { None };
-            for (c, g) in g.iter().enumerate() {
-                for r in 0..3 {
-                    let out = &mut out[(3 * c + r) * all..][..all];
-                    let phi = &phi[r * modes..][..modes];
-                    out[width..].iter_mut().zip(phi).for_each(|(out, x)| *out += x * g);
-                    if let Some(at) = own {
-                        let column = &columns[(3 * at + r) * width..][..width];
-                        out.iter_mut().zip(column).for_each(|(out, x)| *out += x * g);
-                    }
-                }
-            }
+    /// Displacements of the region's nodes by the columns, less the coordinates' part of them, and
+    /// by the coordinates after them, `[node][axis][..]`.
+    pub(super) fn node_rows(&self, columns: &Columns) -> Vec<f64> {
+        let all = columns.width + self.mesh.scales.len();
+        let mut out = vec![0.0; 3 * self.node_count() * all];
+        for ((own, &node), out) in (0..).zip(&self.numbers).zip(out.chunks_exact_mut(3 * all)) {
+            self.node_row(node, Some(own), columns, out);
         }
         out
     }
-}
 
-/// Stiffness of the elements of a region at rest, in rows of 3x3 blocks.
-struct Stiffness {
-    offsets: Vec<usize>,
-    columns: Vec<u32>,
-    blocks: Vec<Matrix3<f64>>,
-}
-
-impl Stiffness {
-    fn new(
-        kind: Element,
-        law: Hyperelastic,
-        count: usize,
-        elements: &[[u32; MAX_NODES]],
-        affine: &[Affine],
-    ) -> Self {
-        let per = kind.node_count();
-        let mut pairs: Vec<[u32; 2]> = elements
-            .iter()
-            .flat_map(|nodes| {
-                let nodes = &nodes[..per];
-                nodes.iter().flat_map(move |&a| nodes.iter().map(move |&b| [a, b]))
-            })
-            .collect();
-        pairs.sort_unstable();
-        pairs.dedup();
-        let offsets: Vec<usize> =
-            (0..=count).map(|row| pairs.partition_point(|&[a, _]| (a as usize) < row)).collect();
-        let columns: Vec<u32> = pairs.into_iter().map(|[_, b]| b).collect();
-        let mut blocks = vec![Matrix3::zeros(); columns.len()];
-        let tangent = law.tangent(&Matrix3::zeros());
-        let (points, share) = tetrahedron::stiffness_points(kind);
-        for (nodes, affine) in elements.iter().zip(affine) {
-            for &point in points {
-                let g = affine.shape_gradients(kind, point);
-                let weight = share * affine.volume;
-                for (b, gb) in nodes[..per].iter().zip(&g) {
-                    // Stresses by unit displacements of node b.
-                    let mut stress = [Matrix3::zeros(); 3];
-                    for (axis, stress) in stress.iter_mut().enumerate() {
-                        for (c, gb) in gb.iter().enumerate() {
-                            let column = tangent.column(3 * c + axis);
-                            stress.iter_mut().zip(column.iter()).for_each(|(s, t)| *s += weight * gb * t);
-                        }
-                    }
-                    for (a, ga) in nodes[..per].iter().zip(&g) {
-                        let start = offsets[*a as usize];
-                        let row = &columns[start..offsets[*a as usize + 1]];
-                        let block = &mut blocks[start + row.partition_point(|c| c < b)];
-                        for (axis, stress) in stress.iter().enumerate() {
-                            let force = stress * Vector3::from(*ga);
-                            (0..3).for_each(|k| block[(k, axis)] += force[k]);
-                        }
-                    }
+    fn node_row(&self, node: u32, own: Option<usize>, columns: &Columns, out: &mut [f64]) {
+        let (modes, width) = (self.mesh.scales.len(), columns.width);
+        let mut phi = vec![0.0; 3 * modes];
+        self.mesh.coordinates(node, &mut phi);
+        for (axis, out) in out.chunks_exact_mut(width + modes).enumerate() {
+            let (first, modal) = out.split_at_mut(width);
+            modal.copy_from_slice(&phi[axis * modes..][..modes]);
+            match own {
+                Some(own) => {
+                    first.copy_from_slice(&columns.values[(3 * own + axis) * width..][..width]);
                 }
+                None => first.fill(0.0),
             }
-        }
-        Self { offsets, columns, blocks }
-    }
-
-    /// Computes `out = K x` for columns stored as `[node][axis][column]`.
-    fn times(&self, x: &[f64], width: usize, out: &mut [f64]) {
-        for (row, out) in out.chunks_exact_mut(3 * width).enumerate() {
-            out.fill(0.0);
-            let range = self.offsets[row]..self.offsets[row + 1];
-            for (&column, block) in self.columns[range.clone()].iter().zip(&self.blocks[range]) {
-                let x = &x[3 * column as usize * width..][..3 * width];
-                for (i, out) in out.chunks_exact_mut(width).enumerate() {
-                    for (j, x) in x.chunks_exact(width).enumerate() {
-                        let k = block[(i, j)];
-                        out.iter_mut().zip(x).for_each(|(out, x)| *out += k * x);
-                    }
-                }
-            }
+            columns.take_out(modal, first);
         }
     }
 
-    /// Replaces forces by displacements of the free nodes, `width` columns at once, by conjugate
-    /// gradients with the inverses of the diagonal blocks (M. R. Hestenes and E. Stiefel, *Methods
-    /// of Conjugate Gradients for Solving Linear Systems*, 1952).
-    fn solve(&self, free: &[bool], f: &mut [f64], width: usize) {
-        let inverses: Vec<Matrix3<f64>> = (0..free.len())
-            .map(|row| {
-                let range = self.offsets[row]..self.offsets[row + 1];
-                let at = range.start + self.columns[range].partition_point(|&c| (c as usize) < row);
-                let diagonal = self.blocks.get(at).and_then(|block| block.try_inverse());
-                diagonal.filter(|_| free[row]).unwrap_or_default()
+    /// Gradients of the columns and of the coordinates after them at quadrature points of elements
+    /// of the mesh, with the points' weights. `rows` are the [`Region::node_rows`].
+    pub(super) fn points(&self, places: &[Place], columns: &Columns, rows: &[f64]) -> Vec<Point> {
+        let per = self.kind.node_count();
+        let all = columns.width + self.mesh.scales.len();
+        let (points, _) = tetrahedron::stiffness_points(self.kind);
+        let mut outer = vec![0.0; 3 * all];
+        let make = |place: &Place| {
+            let affine = self.affine_of(place.element);
+            let g = affine.shape_gradients(self.kind, points[place.point % points.len()]);
+            let nodes = &self.connectivity[place.element as usize * per..][..per];
+            let mut gradients = vec![0.0; 9 * all];
+            let inside = self.elements.binary_search(&place.element).is_ok();
+            for (&node, g) in nodes.iter().zip(&g) {
+                let own = if inside { self.numbers.binary_search(&node).ok() } else { None };
+                let rows = match own {
+                    Some(own) => &rows[3 * own * all..][..3 * all],
+                    None => {
+                        self.node_row(node, None, columns, &mut outer);
+                        &outer
+                    }
+                };
+                widest(AddGradients { rows, g, out: &mut gradients, all });
+            }
+            Point { weight: place.weight, gradients }
+        };
+        places.iter().map(make).collect()
+    }
+
+    /// All quadrature points of the region's elements.
+    pub(super) fn inside(&self) -> Vec<Place> {
+        let points = tetrahedron::stiffness_points(self.kind).0.len();
+        let make = |(&element, affine): (&u32, &Affine)| {
+            let weight = affine.volume / points as f64;
+            (0..points).map(move |point| Place { element, point, weight })
+        };
+        self.elements.iter().zip(&self.affine).flat_map(make).collect()
+    }
+
+    /// At most about `most` quadrature points outside of the region, spread over the body, with
+    /// weights whose sum is the volume there.
+    pub(super) fn outside(&self, size: f64, most: usize) -> Vec<Place> {
+        let mut order: Vec<((i64, [i64; 3]), u32, f64)> = (0..self.mesh.tets.len() as u32)
+            .filter(|element| self.elements.binary_search(element).is_err())
+            .map(|element| {
+                let (center, volume) = self.place(element);
+                // Elements in the order of a coarse grid lie beside each other.
+                let cell: [i64; 3] = std::array::from_fn(|k| (16.0 * center[k] / size).floor() as i64);
+                ((self.octave(element), cell), element, volume)
             })
             .collect();
-        let precondition = |r: &[f64], z: &mut [f64]| {
-            let rows = z.chunks_exact_mut(3 * width).zip(r.chunks_exact(3 * width));
-            for ((z, r), inverse) in rows.zip(&inverses) {
-                for (i, z) in z.chunks_exact_mut(width).enumerate() {
-                    z.fill(0.0);
-                    for (j, r) in r.chunks_exact(width).enumerate() {
-                        z.iter_mut().zip(r).for_each(|(z, r)| *z += inverse[(i, j)] * r);
-                    }
-                }
-            }
-        };
-        let dots = |a: &[f64], b: &[f64]| {
-            let mut sums = vec![0.0; width];
-            for (a, b) in a.chunks_exact(width).zip(b.chunks_exact(width)) {
-                sums.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a * b);
-            }
-            sums
-        };
-        let add = |to: &mut [f64], share: &[f64], from: &[f64], sign: f64| {
-            for (to, from) in to.chunks_exact_mut(width).zip(from.chunks_exact(width)) {
-                for ((to, from), share) in to.iter_mut().zip(from).zip(share) {
-                    *to += sign * share * from;
-                }
-            }
-        };
-        let ratio = |a: &[f64], b: &[f64]| -> Vec<f64> {
-            a.iter().zip(b).map(|(a, b)| if *b > 0.0 { a / b } else { 0.0 }).collect()
-        };
-        let mut residual = f.to_vec();
-        let mut z = vec![0.0; f.len()];
-        precondition(&residual, &mut z);
-        let (mut direction, mut forces) = (z.clone(), vec![0.0; f.len()]);
-        let mut left = dots(&residual, &z);
-        let enough: Vec<f64> = left.iter().map(|x| TOLERANCE * TOLERANCE * x).collect();
-        f.fill(0.0);
-        for _ in 0..MAX_ITERATIONS {
-            self.times(&direction, width, &mut forces);
-            // Nodes that are not free have no direction, and their forces count for nothing.
-            let step = ratio(&left, &dots(&direction, &forces));
-            add(f, &step, &direction, 1.0);
-            add(&mut residual, &step, &forces, -1.0);
-            precondition(&residual, &mut z);
-            let now = dots(&residual, &z);
-            if now.iter().zip(&enough).all(|(now, enough)| now <= enough) {
-                break;
-            }
-            let keep = ratio(&now, &left);
-            for (direction, z) in direction.chunks_exact_mut(width).zip(z.chunks_exact(width)) {
-                for ((direction, z), keep) in direction.iter_mut().zip(z).zip(&keep) {
-                    *direction = z + keep * *direction;
-                }
-            }
-            left = now;
-        }
+        order.sort_by_key(|&(cell, element, _)| (cell, element));
+        let points = tetrahedron::stiffness_points(self.kind).0.len();
+        let stride = (order.len() * points).div_ceil(most).max(1);
+        let groups = order.chunks(stride).enumerate();
+        groups
+            .flat_map(|(group, members)| {
+                // All points of one element of each group, for the volume of the group.
+                let weight = members.iter().map(|(_, _, volume)| volume).sum::<f64>() / points as f64;
+                let (_, element, _) = members[(group * 7919) % members.len()];
+                (0..points).map(move |point| Place { element, point, weight })
+            })
+            .collect()
     }
 }

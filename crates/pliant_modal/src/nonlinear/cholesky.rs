@@ -1,6 +1,6 @@
 //! A dense Cholesky factorization whose loops vectorize, without allocation after its creation.
 
-use crate::simd::dot;
+use crate::simd::{Work, dot, widest};
 
 /// Factor `U^T U` of a symmetric positive definite matrix.
 #[derive(Debug, Clone, Default)]
@@ -23,6 +23,11 @@ impl Cholesky {
     /// Factors the matrix in place. A pivot that is not positive is replaced by a huge one, which
     /// gives its direction no share, so that a matrix with rounding errors or NaN is no panic.
     pub(crate) fn factor(&mut self) {
+        widest(Factor(self));
+    }
+
+    #[inline(always)]
+    fn factor_with(&mut self) {
         let n = self.n;
         for j in 0..n {
             let (above, below) = self.upper.split_at_mut((j + 1) * n);
@@ -89,6 +94,16 @@ impl Cholesky {
     pub(crate) fn solve(&self, x: &mut [f64]) {
         self.forward(x);
         self.backward(x);
+    }
+}
+
+struct Factor<'a>(&'a mut Cholesky);
+
+impl Work for Factor<'_> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        self.0.factor_with();
     }
 }
 

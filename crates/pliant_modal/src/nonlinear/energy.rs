@@ -285,16 +285,21 @@ impl ElasticEnergy {
         let groups = self.weights.chunks(LANES).zip(gradients.values.chunks(9 * stride * LANES));
         for ((weights, values), scaled) in groups.zip(gradients.scaled.chunks(9 * stride * LANES)) {
             // Lanes beyond the last point are at rest.
-            let mut f = [Lane::splat(0.0); 9];
-            (0..3).for_each(|k| f[4 * k] = Lane::splat(1.0));
+            let mut h = [Lane::splat(0.0); 9];
+            for (lane, rows) in values.chunks_exact(9 * stride).enumerate() {
+                let own = gradient(rows, stride, &self.q);
+                h.iter_mut().zip(own.iter()).for_each(|(h, own)| h.0[lane] = *own);
+            }
+            let stress = self.law.stresses(&h);
             for (lane, (&weight, rows)) in weights.iter().zip(values.chunks_exact(9 * stride)).enumerate() {
-                let h = gradient(rows, stride, &self.q);
-                f.iter_mut().zip(h.iter()).for_each(|(f, h)| f.0[lane] += h);
-                add_force(&(weight * self.law.stress(&h)), rows, stride, &mut self.force);
+                let own = Matrix3::from_fn(|r, c| weight * stress[3 * c + r].0[lane]);
+                add_force(&own, rows, stride, &mut self.force);
             }
             if !tangent {
                 continue;
             }
+            let mut f = h;
+            (0..3).for_each(|k| f[4 * k] = f[4 * k] + Lane::splat(1.0));
             let roots = positive_roots(self.law, &f);
             let points = weights.iter().zip(scaled.chunks_exact(9 * stride));
             let outs = self.rows.chunks_exact_mut(9 * padded);
@@ -309,7 +314,8 @@ impl ElasticEnergy {
                 }
                 combine(&factors, rows, stride, out, padded);
             }
-            add_squares(&self.rows[..9 * padded * weights.len()], modes, padded, &mut self.tangent);
+            let rows = &self.rows[..9 * padded * weights.len()];
+            add_squares(rows, modes, padded, &mut self.tangent);
         }
     }
 }

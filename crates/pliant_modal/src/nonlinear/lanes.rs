@@ -47,10 +47,41 @@ impl Mul<Lane> for f64 {
     }
 }
 
+/// A number, or one in each lane, for formulas that serve both.
+pub(crate) trait Number:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
+{
+    fn of(x: f64) -> Self;
+}
+
+impl Number for f64 {
+    #[inline(always)]
+    fn of(x: f64) -> Self {
+        x
+    }
+}
+
+impl Number for Lane {
+    #[inline(always)]
+    fn of(x: f64) -> Self {
+        Self::splat(x)
+    }
+}
+
 impl Lane {
     #[inline(always)]
     pub(crate) fn splat(x: f64) -> Self {
         Self([x; LANES])
+    }
+
+    /// Computes `self + by * x` with one rounding.
+    #[inline(always)]
+    pub(crate) fn plus(self, by: f64, x: Self) -> Self {
+        let mut out = self;
+        for l in 0..LANES {
+            out.0[l] = by.mul_add(x.0[l], out.0[l]);
+        }
+        out
     }
 
     #[inline(always)]

@@ -5,7 +5,7 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::lanes::Lane;
+use super::lanes::{Lane, Number};
 
 /// Second derivative of the energy density by the deformation gradient, Pa. Row and column
 /// `3 c + r` belong to entry (r, c).
@@ -90,20 +90,59 @@ impl Hyperelastic {
 
     /// Returns the first Piola-Kirchhoff stress `P = dW/dF`, Pa.
     pub fn stress(self, h: &Matrix3<f64>) -> Matrix3<f64> {
-        let f = Matrix3::identity() + h;
+        let mut entries = [0.0; 9];
+        entries.copy_from_slice(h.as_slice());
+        Matrix3::from_column_slice(&self.stresses(&entries))
+    }
+
+    /// The same for numbers or lanes, entry `3 c + r` for (r, c).
+    #[inline(always)]
+    pub(crate) fn stresses<T: Number>(self, h: &[T; 9]) -> [T; 9] {
+        let one = T::of(1.0);
+        let trace = h[0] + h[4] + h[8];
+        let mut square = h[0] * h[0];
+        for x in &h[1..] {
+            square = square + *x * *x;
+        }
+        let mut out = *h;
         match self.0 {
             Law::NeoHookean { lambda, mu } => {
-                let t = 2.0 * h.trace() + h.norm_squared();
                 // The cofactor of F is I + c.
-                let c = h.trace() * Matrix3::identity() - h.transpose() + cofactor(h);
-                let j = volume_change(h);
-                0.75 * mu * (h - c) + mu * t / (4.0 * (4.0 + t)) * f + lambda * j * (Matrix3::identity() + c)
+                let c = cofactor_less_one(h);
+                let turned = h[0] * h[0] + h[4] * h[4] + h[8] * h[8];
+                let turned = turned + T::of(2.0) * (h[1] * h[3] + h[2] * h[6] + h[5] * h[7]);
+                // That of h, less its trace and with its transpose.
+                let bent = [c[0] + h[0] - trace, c[1] + h[3], c[2] + h[6]];
+                let det = h[0] * bent[0] + h[1] * bent[1] + h[2] * bent[2];
+                let j = trace + T::of(0.5) * (trace * trace - turned) + det;
+                let t = trace + trace + square;
+                let all = T::of(mu) * t / (T::of(16.0) + T::of(4.0) * t);
+                let pressure = T::of(lambda) * j;
+                for e in 0..9 {
+                    let own = if e % 4 == 0 { one } else { T::of(0.0) };
+                    out[e] = T::of(0.75 * mu) * (h[e] - c[e]) + all * (own + h[e]) + pressure * (own + c[e]);
+                }
             }
             Law::StVenantKirchhoff { lambda, mu } => {
-                let e = green_strain(h);
-                f * (lambda * e.trace() * Matrix3::identity() + 2.0 * mu * e)
+                let [a, b, c] = [[h[0], h[1], h[2]], [h[3], h[4], h[5]], [h[6], h[7], h[8]]];
+                let columns = [a, b, c];
+                let dot = |a: &[T; 3], b: &[T; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+                let all = T::of(lambda) * (trace + T::of(0.5) * square);
+                for k in 0..3 {
+                    // Column k of the second stress, and of F times it.
+                    let mut s = [all; 3];
+                    for i in 0..3 {
+                        let strain = columns[k][i] + columns[i][k] + dot(&columns[i], &columns[k]);
+                        let rest = if i == k { all } else { T::of(0.0) };
+                        s[i] = rest + T::of(mu) * strain;
+                    }
+                    for r in 0..3 {
+                        out[3 * k + r] = s[r] + (a[r] * s[0] + b[r] * s[1] + c[r] * s[2]);
+                    }
+                }
             }
         }
+        out
     }
 
     /// Returns the part of the stress that is of second order in `h`, Pa.
@@ -244,6 +283,28 @@ fn cofactor(h: &Matrix3<f64>) -> Matrix3<f64> {
     let column = |k: usize| -> Vector3<f64> { h.column(k).into() };
     let (a, b, c) = (column(0), column(1), column(2));
     Matrix3::from_columns(&[b.cross(&c), c.cross(&a), a.cross(&b)])
+}
+
+/// Returns the cofactor of `I + h` less `I`.
+#[inline(always)]
+fn cofactor_less_one<T: Number>(h: &[T; 9]) -> [T; 9] {
+    let trace = h[0] + h[4] + h[8];
+    let cross = |a: [T; 3], b: [T; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let [a, b, c] = [[h[0], h[1], h[2]], [h[3], h[4], h[5]], [h[6], h[7], h[8]]];
+    let [x, y, z] = [cross(b, c), cross(c, a), cross(a, b)];
+    [
+        x[0] + trace - h[0],
+        x[1] - h[3],
+        x[2] - h[6],
+        y[0] - h[1],
+        y[1] + trace - h[4],
+        y[2] - h[7],
+        z[0] - h[2],
+        z[1] - h[5],
+        z[2] + trace - h[8],
+    ]
 }
 
 /// Returns `det(I + h) - 1`.

@@ -22,6 +22,7 @@ mod principal;
 pub(crate) use cholesky::Cholesky;
 pub use energy::ElasticEnergy;
 pub(crate) use energy::Gradients;
+pub(crate) use lanes::{LANES, Lane};
 pub use material::{Hyperelastic, Material};
 pub use principal::positive_tangent;
 
