@@ -184,7 +184,14 @@ mod tests {
         let tets = vec![[0, 1, 2, 3], [1, 4, 2, 3]];
         let nodes = corners.len() + tetrahedron::connectivity(5, &tets, Element::Tet10).1.len();
         let displacements = vec![0; 3 * nodes];
-        SimulationMesh { corners, tets, scales: vec![1.0], displacements, vertices: Vec::new() }
+        SimulationMesh {
+            corners,
+            tets,
+            scales: vec![1.0],
+            displacements,
+            vertices: Vec::new(),
+            stiffness: Vec::new(),
+        }
     }
 
     #[test]
