@@ -119,8 +119,8 @@ fn a_hand_feels_a_stiff_core_in_a_soft_hull() {
     let patch = Patch::around(model.surface(), end.unwrap() as u32, 0.113 * 0.6).unwrap();
     for (elasticity, way, most) in [
         (Elasticity::Linear, [5e-5, 1e-4, 5e-5], 0.005),
-        (Elasticity::Reduced, [0.0, 0.05, 0.0], 0.005),
-        (Elasticity::Reduced, [0.0, -0.05, 0.0], 0.005),
+        (Elasticity::Reduced, [0.0, 0.05, 0.0], 0.01),
+        (Elasticity::Reduced, [0.0, -0.05, 0.0], 0.01),
     ] {
         let held = [PrescribedPatch { patch: patch.clone(), displacement: way }];
         let loads = StaticLoads { prescribed: &held, ..Default::default() };
