@@ -45,6 +45,9 @@ pub enum BodyError {
     /// number is NaN or infinite, or the resulting velocity of the body is not finite.
     #[error("the impulse was refused: {0}")]
     Impulse(StepError),
+    /// The settings or the target of a [`TouchProbe`](crate::TouchProbe) are out of range.
+    #[error("the probe touches nothing: {0}")]
+    Probe(StepError),
     /// The entity of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is not a body, or
     /// its model is not loaded yet.
     #[error("the impulse was refused: this entity is no body, or its model is not there yet")]

@@ -61,6 +61,7 @@ mod pick;
 mod picking;
 #[cfg(feature = "picking")]
 mod pointer;
+mod probe;
 mod ride_on;
 mod riding;
 mod saved;
@@ -97,6 +98,7 @@ pub use pick::{SurfaceHit, pick_surface};
 pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSettings};
 #[cfg(feature = "picking")]
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
+pub use probe::{ProbeState, TouchProbe, Touching};
 pub use ride_on::RideOn;
 pub use riding::RidingPlugin;
 pub use saved::SavedState;
@@ -218,6 +220,7 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<SingleSteps>()
             .register_type::<Impulse>()
             .register_type::<Push>()
+            .register_type::<TouchProbe>()
             .add_message::<SingleSteps>()
             .add_message::<Impulse>()
             .add_message::<Push>()

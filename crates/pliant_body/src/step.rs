@@ -9,12 +9,14 @@ use bevy::{
     platform::time::Instant,
     prelude::*,
 };
-use pliant_modal::{Body, BodyConfig, GrabConfig, Islands, ModalModel, Patch, StepError, Together, Touched};
+use pliant_modal::{
+    Body, BodyConfig, GrabConfig, Islands, ModalModel, Patch, Probe, StepError, Together, Touched,
+};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed,
-    Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, Released, STEP_TIME, SavedState, VisualState,
-    body::HeldBody,
+    Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, ProbeState, Released, STEP_TIME, SavedState,
+    TouchProbe, VisualState, body::HeldBody,
 };
 
 /// The tick: the number of steps that the schedule of the bodies has made.
@@ -331,25 +333,28 @@ pub(crate) fn step_bodies(
     mut refusals: Refusals,
     mut islands: Local<Islands>,
     mut bodies: Query<(NameOrEntity, &ModalBody, &Driven, &mut BodyState)>,
+    mut probes: Query<(NameOrEntity, &TouchProbe, &mut ProbeState)>,
 ) {
     let start = Instant::now();
     let step = time.delta_secs_f64();
     let mut all: Vec<_> = Vec::new();
+    let probed = probes.iter().any(|(_, probe, _)| probe.enabled);
     for (name, body, driven, mut state) in &mut bodies {
         // A resting body takes part only where others may wake it.
         let steps = *driven == Driven::Local && !state.resting;
         if state.stepped != steps {
             state.stepped = steps;
         }
-        if steps || (*driven == Driven::Local && state.layers.is_some()) {
+        if steps || (*driven == Driven::Local && (probed || state.layers.is_some())) {
             all.push((name, body.rest_speed, state));
         }
     }
     // In one order, so that the order of archetypes makes no difference.
     all.sort_by_key(|(name, ..)| name.entity.to_bits());
-    if all.iter().all(|(.., state)| state.resting) {
+    if !probed && all.iter().all(|(.., state)| state.resting) {
         all.clear();
     }
+    let (mut held, mut taken) = take_probes(&mut probes, &all, &mut refusals);
     let traits: Vec<_> = all.iter().map(|(.., state)| (state.layers, state.scale)).collect();
     let mut together: Vec<Together<'_>> = Vec::with_capacity(all.len());
     for (name, _, state) in &mut all {
@@ -366,13 +371,20 @@ pub(crate) fn step_bodies(
         (member.resting, member.error) = (resting, lengthened.err());
         together.push(member);
     }
-    islands.step(&mut together, |a, b| {
+    let may_touch = |a: usize, b: usize| {
         let ((Some([memberships, filters]), scale), (Some(other), of_other)) = (traits[a], traits[b]) else {
             return false;
         };
         scale == of_other && memberships & other[1] != 0 && other[0] & filters != 0
-    });
+    };
+    let may_probe = |probe: usize, body: usize| held[probe].1 == traits[body].1;
+    islands.step_with(&mut together, &mut taken, step, may_touch, may_probe);
     let results: Vec<_> = together.into_iter().map(|member| (member.resting, member.error)).collect();
+    for ((entity, _), probe) in held.drain(..).zip(taken) {
+        if let Ok((.., mut state)) = probes.get_mut(entity) {
+            state.give(probe);
+        }
+    }
     let mut stepped = 0_usize;
     for ((name, rest_speed, state), (resting, error)) in all.iter_mut().zip(results) {
         if resting {
@@ -401,6 +413,34 @@ pub(crate) fn step_bodies(
     }
 }
 
+/// Takes the probes for a step: the entity of each and the scale of the bodies that it touches, and
+/// the probes.
+fn take_probes(
+    probes: &mut Query<(NameOrEntity, &TouchProbe, &mut ProbeState)>,
+    bodies: &[(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)],
+    refusals: &mut Refusals,
+) -> (Vec<(Entity, f64)>, Vec<Probe>) {
+    let (mut held, mut taken) = (Vec::new(), Vec::new());
+    for (name, wanted, mut state) in probes {
+        let away = |state: &BodyState| {
+            (DVec3::from(state.body.frame().center()) * state.scale).distance_squared(wanted.target)
+        };
+        let nearest = bodies.iter().min_by(|a, b| away(&a.2).total_cmp(&away(&b.2)));
+        match state.take(wanted, nearest.map_or(1.0, |(.., state)| state.scale)) {
+            Ok(Some(probe)) => {
+                held.push((name.entity, state.scale()));
+                taken.push(probe);
+            }
+            Ok(None) => {}
+            Err(error) => refusals.report(&name, name.entity, BodyError::Probe(error)),
+        }
+    }
+    // In one order, so that the order of archetypes makes no difference.
+    let mut order: Vec<_> = held.into_iter().zip(taken).collect();
+    order.sort_by_key(|((entity, _), _)| entity.to_bits());
+    order.into_iter().unzip()
+}
+
 /// Lets the bodies rest that have been slow for long enough, and that touch only such bodies.
 fn rest(all: &mut [(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)]) {
     let index = |bits: u64| all.binary_search_by_key(&bits, |(name, ..)| name.entity.to_bits()).ok();
@@ -409,7 +449,7 @@ fn rest(all: &mut [(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)]) {
         let stirred = |(.., state): &(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)| {
             state.body.contacts().contacts().iter().any(|contact| match contact.other {
                 Touched::Body(bits) => index(bits).is_some_and(|other| !calm[other]),
-                Touched::Obstacle(_) => false,
+                Touched::Obstacle(_) | Touched::Probe(_) => false,
             })
         };
         let next: Vec<bool> = all.iter().zip(&calm).map(|(body, calm)| *calm && !stirred(body)).collect();

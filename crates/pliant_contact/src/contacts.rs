@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use bevy::{ecs::entity::MapEntities, math::DVec3, prelude::*};
 use nalgebra::Vector3;
-use pliant_body::{BodyError, BodyRefused, BodyState, Driven};
-use pliant_modal as modal;
+use pliant_body::{BodyError, BodyRefused, BodyState, Driven, ProbeState, TouchProbe};
+use pliant_modal::{self as modal, StepError};
 
 use crate::obstacle::{ContactLayers, Motion, Nothing};
 
@@ -147,13 +147,15 @@ type Bodies<'w, 's> = Query<
     ),
 >;
 
-/// Gives each body the obstacles near it. What has not changed is not touched, so that bodies rest.
+/// Gives each body and each probe the obstacles near it. What has not changed is not touched, so
+/// that bodies rest.
 pub(crate) fn place_obstacles(
     time: Res<Time>,
     mut commands: Commands,
     obstacles: Query<(Entity, &Motion, Option<Ref<ContactLayers>>)>,
     mut last: Local<Vec<Entity>>,
     mut bodies: Bodies,
+    mut probes: Query<(Entity, &TouchProbe, &mut ProbeState)>,
 ) {
     let step = time.delta_secs_f64();
     // In the order of entities, so that the order of archetypes makes no difference.
@@ -165,6 +167,11 @@ pub(crate) fn place_obstacles(
     if stirred {
         last.clear();
         last.extend(all.iter().map(|(entity, ..)| *entity));
+    }
+    for (entity, probe, mut state) in &mut probes {
+        if let Err(error) = give_probe(&all, probe, &mut state) {
+            refusals.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+        }
     }
     for (entity, mut state, mut nearby, driven, layers, friction) in &mut bodies {
         let touched = changed(&layers) || friction.as_ref().is_some_and(Ref::is_changed);
@@ -230,6 +237,30 @@ pub(crate) fn place_obstacles(
     }
 }
 
+/// Farthest distance of an obstacle that a probe is given, m, besides its way in a step.
+const NEAR: f64 = 0.1;
+
+/// Gives a probe the obstacles near it. `all` is in the order of entities.
+fn give_probe(
+    all: &[(Entity, &Motion, Option<Ref<ContactLayers>>)],
+    probe: &TouchProbe,
+    state: &mut ProbeState,
+) -> Result<(), StepError> {
+    let Some((center, scale)) = state.around() else { return Ok(()) };
+    let reach = NEAR + 3.0 * probe.radius + 2.0 * center.distance(probe.target);
+    let local = Vector3::from((center / scale).to_array());
+    let near: Vec<(Entity, &Motion)> = all
+        .iter()
+        .filter(|(_, motion, _)| motion.distance(scale, &local) * scale <= reach)
+        .map(|(entity, motion, _)| (*entity, *motion))
+        .collect();
+    let same = near.iter().map(|(entity, _)| *entity).eq(state.obstacles().iter().copied());
+    if same && near.iter().all(|(_, motion)| !motion.changed) {
+        return Ok(());
+    }
+    state.set_obstacles(near.into_iter().map(|(entity, motion)| (entity, motion.obstacle(scale))).collect())
+}
+
 /// Tells the bodies which others they touch, and wakes a body when another that it touches is moved
 /// away from it.
 pub(crate) fn touch_bodies(
@@ -280,6 +311,8 @@ pub(crate) fn publish(
             let other = match contact.other {
                 modal::Touched::Obstacle(index) => nearby.slots.get(index).copied().flatten()?,
                 modal::Touched::Body(bits) => Entity::try_from_bits(bits)?,
+                // What a hand's probe does is told there.
+                modal::Touched::Probe(_) => return None,
             };
             Some(ContactPoint {
                 other,

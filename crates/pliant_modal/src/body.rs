@@ -658,6 +658,21 @@ impl Body {
         self.motion = FrameMotion::default();
     }
 
+    /// Bound on the speed of the surface about the frame, m/s.
+    pub(crate) fn speed_bound(&self) -> f64 {
+        self.contacts.places.as_ref().map_or(0.0, |sites| sites.bound(&self.state.v))
+    }
+
+    /// Whether the surface is no farther from a point (m, world axes) than `within` (m), or the
+    /// point is inside. Chooses the contact sites at the first call.
+    pub(crate) fn is_near(&mut self, point: &Vector3<f64>, within: f64) -> bool {
+        if self.contacts.places.is_none() && self.kernel.prepare_contacts(&mut self.contacts).is_err() {
+            return false;
+        }
+        let Some(sites) = &self.contacts.places else { return false };
+        self.kernel.shape(sites, &self.state, None, None).is_near(point, within)
+    }
+
     pub(crate) fn contacts_mut(&mut self) -> &mut Contacts {
         &mut self.contacts
     }

@@ -3,8 +3,8 @@
 use nalgebra::Vector3;
 
 use crate::{
-    Body, StepError, StepReport,
-    contact::{Sixes, Touching},
+    Body, Probe, StepError, StepReport,
+    contact::{Sixes, Touched, Touching},
     step::group::{self, Member, Parts, View},
 };
 
@@ -129,6 +129,8 @@ pub struct Islands {
     local: Vec<u32>,
     members: Vec<[u32; 2]>,
     moves: Vec<bool>,
+    /// The probes of the present island.
+    held: Vec<usize>,
 }
 
 impl Islands {
@@ -138,10 +140,27 @@ impl Islands {
     /// Where the step of an island fails, all of its bodies have the error as their
     /// [`Together::error`], and are stepped as if they did not touch each other.
     pub fn step(&mut self, bodies: &mut [Together<'_>], may_touch: impl Fn(usize, usize) -> bool) {
+        self.step_with(bodies, &mut [], 0.0, may_touch, |_, _| false);
+    }
+
+    /// Performs one step of `h` seconds of all bodies that move, and of all probes. `may_probe`
+    /// says whether a probe may touch a body, by their indices. A body of another step length than
+    /// `h` is not touched by probes. A probe wakes the bodies that it may reach in the step.
+    ///
+    /// Where the step of an island fails, its probes are at their targets and touch nothing.
+    pub fn step_with(
+        &mut self,
+        bodies: &mut [Together<'_>],
+        probes: &mut [Probe],
+        h: f64,
+        may_touch: impl Fn(usize, usize) -> bool,
+        may_probe: impl Fn(usize, usize) -> bool,
+    ) {
         self.work.begin_step();
         self.find_pairs(bodies, &may_touch);
-        self.find_islands(bodies);
-        self.wake(bodies);
+        self.find_probed(bodies, probes, h, &may_probe);
+        self.find_islands(bodies, probes);
+        self.wake(bodies, probes);
         for together in bodies.iter_mut().filter(|together| !together.resting) {
             together.report = StepReport::default();
             together.body.contacts_mut().key = together.key;
@@ -152,20 +171,37 @@ impl Islands {
             let island = bodies[self.order[begin]].island;
             let count =
                 self.order[begin..].iter().take_while(|&&index| bodies[index].island == island).count();
-            self.step_island(bodies, begin, begin + count);
+            self.step_island(bodies, begin, begin + count, (probes, h));
             begin += count;
+        }
+        for index in 0..probes.len() {
+            if probes[index].near.is_empty() {
+                let held = (&mut *probes, &[index][..], h);
+                // The probe whose obstacle has failed is at its target.
+                let _ = group::step(bodies, &[], &[], &mut [], held, &mut self.work);
+            }
         }
         for together in bodies.iter_mut().filter(|together| !together.resting) {
             together.body.end_step();
         }
     }
 
-    fn step_island(&mut self, bodies: &mut [Together<'_>], begin: usize, end: usize) {
+    fn step_island(
+        &mut self,
+        bodies: &mut [Together<'_>],
+        begin: usize,
+        end: usize,
+        (probes, h): (&mut [Probe], f64),
+    ) {
         let who = &self.order[begin..end];
         if who.first().is_none_or(|&first| bodies[first].resting) {
             return;
         }
-        if let [one] = who {
+        self.held.clear();
+        let of_island =
+            |probe: &Probe| probe.near.first().is_some_and(|&n| self.first[n] == self.first[who[0]]);
+        self.held.extend((0..probes.len()).filter(|&index| of_island(&probes[index])));
+        if let ([one], true) = (who, self.held.is_empty()) {
             bodies[*one].step_alone();
             return;
         }
@@ -180,7 +216,11 @@ impl Islands {
             }
         }
         let sixes = &mut self.sixes[..who.len()];
-        let Err(error) = group::step(bodies, who, &self.members, sixes, &mut self.work) else { return };
+        let Err(error) =
+            group::step(bodies, who, &self.members, sixes, (probes, &self.held, h), &mut self.work)
+        else {
+            return;
+        };
         for &index in who {
             let together = &mut bodies[index];
             together.body.contacts_mut().forget();
@@ -207,21 +247,53 @@ impl Islands {
         self.pairs.sort_unstable();
     }
 
-    /// Wakes the islands of which a member moves.
-    fn wake(&mut self, bodies: &mut [Together<'_>]) {
+    /// Begins the step of all probes, and finds the bodies near each.
+    fn find_probed(
+        &mut self,
+        bodies: &mut [Together<'_>],
+        probes: &mut [Probe],
+        h: f64,
+        may_probe: &impl Fn(usize, usize) -> bool,
+    ) {
+        for (number, probe) in probes.iter_mut().enumerate() {
+            let way = probe.begin_step(h);
+            let mut near = std::mem::take(&mut probe.near);
+            near.clear();
+            for ball in self.balls.iter().filter(|ball| ball.step == h && may_probe(number, ball.index)) {
+                let reach = way + probe.config().radius;
+                let body = &mut *bodies[ball.index].body;
+                let own =
+                    ball.step * (ball.velocity.norm() + body.speed_bound()) + MARGIN * body.model().size();
+                let touched = probe.memory.iter().any(|m| m.other == Touched::Body(bodies[ball.index].key));
+                if (ball.center - probe.start).norm() <= ball.radius + own + reach
+                    && (touched || bodies[ball.index].body.is_near(&probe.start, reach + own))
+                {
+                    near.push(ball.index);
+                }
+            }
+            near.sort_unstable();
+            probe.near = near;
+        }
+    }
+
+    /// Wakes the islands of which a member moves or is touched by a probe.
+    fn wake(&mut self, bodies: &mut [Together<'_>], probes: &[Probe]) {
         // The entry of each island's first body says whether one moves.
         self.moves.clear();
         self.moves.resize(bodies.len(), false);
         for together in bodies.iter() {
             self.moves[together.island] |= !together.resting;
         }
+        for &near in probes.iter().flat_map(|probe| &probe.near) {
+            self.moves[bodies[near].island] = true;
+        }
         for together in bodies.iter_mut() {
             together.resting = !self.moves[together.island];
         }
     }
 
-    /// Joins the bodies of all pairs.
-    fn find_islands(&mut self, bodies: &mut [Together<'_>]) {
+    /// Joins the bodies of all pairs, and those near one probe.
+    fn find_islands(&mut self, bodies: &mut [Together<'_>], probes: &[Probe]) {
         self.first.clear();
         self.first.extend(0..bodies.len());
         let root = |first: &[usize], mut index: usize| {
@@ -230,8 +302,9 @@ impl Islands {
             }
             index
         };
-        for pair in &self.pairs {
-            let [a, b] = pair.map(|index| root(&self.first, index as usize));
+        let probed = probes.iter().flat_map(|probe| probe.near.windows(2).map(|pair| [pair[0], pair[1]]));
+        for pair in self.pairs.iter().map(|pair| pair.map(|index| index as usize)).chain(probed) {
+            let [a, b] = pair.map(|index| root(&self.first, index));
             self.first[a.max(b)] = a.min(b);
         }
         for (index, body) in bodies.iter_mut().enumerate() {

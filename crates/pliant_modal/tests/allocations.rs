@@ -14,8 +14,8 @@ use std::{
 
 use nonlinear_rod::nonlinear_rod;
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, FrameMotion, GrabConfig, Integrator, Islands, Patch, Plane, Relaxation,
-    StepSettings, Together,
+    Body, BodyConfig, Elasticity, FrameMotion, GrabConfig, Integrator, Islands, Patch, Plane, Probe,
+    ProbeConfig, Relaxation, StepSettings, Together,
 };
 use rod::{rod, tip};
 
@@ -186,5 +186,35 @@ fn a_step_of_bodies_that_touch_each_other_allocates_nothing_once_they_have_touch
         touched |= step >= 120 && above.contacts().contacts().iter().any(other);
     }
     assert!(touched, "they touched");
+    assert_eq!(calls, 0);
+}
+
+#[test]
+fn a_step_with_a_probe_allocates_nothing_once_it_has_touched() {
+    let pip = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal");
+    let model = Arc::new(pliant_modal::ModalModel::read(pip).unwrap());
+    let mut body = Body::new(model.clone(), StepSettings::default().into()).unwrap();
+    let top = *model.surface().positions().iter().max_by(|a, b| a[1].total_cmp(&b[1])).unwrap();
+    let top = top.map(f64::from);
+    let above = [top[0], top[1] + 0.02, top[2]];
+    let config = ProbeConfig::default();
+    let mut probes = [Probe::new(config, above).unwrap()];
+    let floor = Plane { point: [0.0, top[1] - 0.01, 0.0], normal: [0.0, 1.0, 0.0] };
+    probes[0].set_obstacles(vec![Arc::new(floor)]).unwrap();
+    let (mut islands, mut calls, mut touched) = (Islands::default(), 0, 0);
+    for step in 0..240 {
+        let phase = f64::from(step) * 0.1;
+        let down = 0.012 * (1.0 - phase.cos());
+        probes[0].set_target([above[0] + 0.005 * phase.sin(), above[1] - down, above[2]]).unwrap();
+        let before = CALLS.with(Cell::get);
+        let mut all = [Together::new(0, &mut body)];
+        islands.step_with(&mut all, &mut probes, 1.0 / 60.0, |_, _| true, |_, _| true);
+        // The first contacts make room.
+        if step >= 120 {
+            calls += CALLS.with(Cell::get) - before;
+            touched += usize::from(probes[0].force() != [0.0; 3]);
+        }
+    }
+    assert!(touched > 20 && touched < 120, "it touches and lets go: {touched}");
     assert_eq!(calls, 0);
 }

@@ -13,6 +13,7 @@ pub mod model;
 mod pausing;
 #[cfg(feature = "picking")]
 mod pointer;
+mod probe;
 mod settings;
 mod stepping;
 mod surface_anchor;

@@ -17,6 +17,23 @@ pub(crate) enum Status {
 /// Largest number of rounds for the direction of a slip.
 const ROUNDS: usize = 60;
 
+/// Force of one contact with Signorini's law in the normal and Coulomb's in the tangents, N, and
+/// whether it slides. The first number is along the normal, the others along two tangents.
+///
+/// `free` is the gap (m) and the tangential offset from where the contact sticks (m) without the
+/// force. `response` is what a unit force adds to them, symmetric and positive definite, m/N.
+/// `guess` is a force of about the same direction. What is not finite gives no force.
+pub fn contact_force(
+    response: &Matrix3<f64>,
+    free: &Vector3<f64>,
+    friction: f64,
+    guess: &Vector3<f64>,
+) -> (Vector3<f64>, bool) {
+    let (force, status) = solve(response, free, friction, guess);
+    let sound = force.iter().all(|x| x.is_finite());
+    if sound { (force, status == Status::Slip) } else { (Vector3::zeros(), false) }
+}
+
 /// Solves `gap = free + response force` for the force (N; normal first, then two tangents) with
 /// Signorini's law in the normal and Coulomb's in the tangents.
 ///

@@ -15,6 +15,8 @@ pub enum Touched {
     Obstacle(usize),
     /// The body with this key, see [`Together::key`](crate::Together::key).
     Body(u64),
+    /// The [`Probe`](crate::Probe) at this index of the step's list.
+    Probe(usize),
 }
 
 /// A contact of the last step that carried force.
@@ -145,7 +147,7 @@ impl Contacts {
         obstacles.iter().try_for_each(|obstacle| obstacle.check())?;
         let left = |memory: &Memory| match memory.other {
             Touched::Obstacle(index) => index < obstacles.len(),
-            Touched::Body(_) => true,
+            Touched::Body(_) | Touched::Probe(_) => true,
         };
         self.memory.retain(left);
         self.obstacles = obstacles;

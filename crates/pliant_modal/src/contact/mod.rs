@@ -24,16 +24,20 @@ mod cone;
 mod contacts;
 mod obstacle;
 mod point;
+mod probe;
 mod shape;
 mod sites;
 mod solver;
 mod surface_field;
 
+pub use cone::contact_force;
 pub use contacts::{Contact, ContactReport, Contacts, Touched};
 pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint};
+pub use probe::{Probe, ProbeConfig, ProbeContact};
 
-pub(crate) use point::{Far, Memory, Point};
+pub(crate) use point::{AtProbe, Far, Memory, Point};
+pub(crate) use probe::{Grown, ProbeMemory};
 pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};
 pub(crate) use solver::{Clearance, Look, Touching};
-pub(crate) use surface_field::{Bent, Cloud, Place, closest_on_triangle};
+pub(crate) use surface_field::{Bent, Carriers, Cloud, Place, closest_on_triangle};

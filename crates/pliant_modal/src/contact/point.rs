@@ -49,6 +49,21 @@ pub(crate) struct Far {
     pub(crate) anchor: Vector3<f64>,
 }
 
+/// The side of a contact at a probe.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AtProbe {
+    /// The probe, as an index into those of the group, and its span.
+    pub(crate) probe: usize,
+    pub(crate) span: usize,
+    /// The material of the body that touches, and the sites on which the force acts. They stay as
+    /// the step finds them. `None` at an obstacle.
+    pub(crate) first: Option<(Place, Carriers)>,
+    /// The place of the body that is nearest at the end of the step.
+    pub(crate) last: Option<Place>,
+    /// A point and the normal of the surface at the end of the last computed step, m, world axes.
+    pub(crate) plane: [Vector3<f64>; 2],
+}
+
 /// A place that touches, or may touch, in this step.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Point {
@@ -58,6 +73,9 @@ pub(crate) struct Point {
     pub(crate) other: Touched,
     /// The side at another body. `None` at an obstacle.
     pub(crate) far: Option<Far>,
+    /// The side at a probe. The force is on the body, and at an obstacle on the probe, whose span
+    /// then is the member. The anchor is relative to the center of the ball at a body.
+    pub(crate) probe: Option<AtProbe>,
     pub(crate) friction: f64,
     /// Directions from the site's center to the contact point at the beginning and at the end of
     /// the step, body axes.
@@ -111,6 +129,7 @@ impl Point {
             site,
             other,
             far: None,
+            probe: None,
             friction,
             first: zero,
             last: zero,

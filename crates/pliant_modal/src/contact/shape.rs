@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::{
     ContactSites,
-    surface_field::{Carriers, Cloud, Place, SurfaceField},
+    surface_field::{Carriers, Cloud, Place, SMOOTH, SurfaceField},
 };
 use crate::{
     HeldPatch,
@@ -264,6 +264,80 @@ impl Shape<'_> {
             reach = near;
         }
         Err(0.0)
+    }
+
+    /// The place of the surface that is nearest to a point (m, world axes), no farther than
+    /// `within` (m), whichever way it looks. `kept` is a place that is near.
+    ///
+    /// Beside an edge or a corner, where the surface is not smooth, the normal leads to the point.
+    pub(crate) fn nearest(&self, point: &Vector3<f64>, within: f64, kept: Option<&Place>) -> Option<Near> {
+        let local = self.frame.to_local(point);
+        let still = 1e-6 * self.size;
+        let pulled = |place: &Place| {
+            let (moved, gradient) = self.deformed(place);
+            let rest = self.field.rest(place);
+            Some((rest + gradient.try_inverse()? * (local - rest - moved), moved, gradient))
+        };
+        let mut hint = kept.filter(|kept| self.field.has(kept)).copied();
+        let (mut x, mut reach) = (local, within + self.bound);
+        if let Some(kept) = &hint {
+            (x, reach) = (pulled(kept)?.0, 2.0 * within + 0.01 * self.size);
+        }
+        for round in 0..ROUNDS {
+            let place = self.field.closest(&x, None, reach, hint.as_ref())?;
+            hint = Some(place);
+            let (next, moved, gradient) = pulled(&place)?;
+            if (next - x).norm() <= still || round + 1 == ROUNDS {
+                let near = self.near(&place, &moved, &gradient, point);
+                let way = point - near.at;
+                let length = way.norm();
+                let sharp = near.normal.dot(&way) < SMOOTH * length && near.normal.dot(&way) > 0.0;
+                let near = if sharp { Near { normal: way / length, distance: length, ..near } } else { near };
+                return (near.distance.abs() <= within).then_some(near);
+            }
+            x = next;
+            reach = 2.0 * within + 0.01 * self.size;
+        }
+        None
+    }
+
+    /// Whether a point (m, world axes) is inside, or no farther from the surface than `within` (m).
+    pub(crate) fn is_near(&self, point: &Vector3<f64>, within: f64) -> bool {
+        let x = self.pull_back(point);
+        let Some(place) = self.field.closest(&x, None, f64::MAX.sqrt(), None) else { return false };
+        let near = self.at(&place, point);
+        near.distance <= 0.0 || (point - near.at).norm() <= within
+    }
+
+    /// Follows the way of a ball's center (m, body axes at rest) until the ball touches the
+    /// surface, and returns that place.
+    pub(crate) fn sweep(&self, from: &Vector3<f64>, to: &Vector3<f64>, radius: f64) -> Option<Place> {
+        const STEPS: usize = 64;
+        let way = to - from;
+        let length = way.norm();
+        if length <= 0.0 || !length.is_finite() {
+            return None;
+        }
+        let mut gone = 0.0;
+        for _ in 0..STEPS {
+            let x = from + way * (gone / length);
+            let place = self.field.closest(&x, None, length - gone + radius, None)?;
+            let (_, normal, _) = self.field.normals(&place);
+            let off = x - self.field.rest(&place);
+            let away = off.norm() - radius;
+            if away <= 1e-3 * length {
+                return (off.dot(&way) < 0.0 || normal.dot(&way) < 0.0).then_some(place);
+            }
+            if normal.dot(&off) <= 0.0 && gone <= 0.0 {
+                // It begins deep inside.
+                return None;
+            }
+            gone += away;
+            if gone >= length {
+                return None;
+            }
+        }
+        None
     }
 
     /// A point (m, world axes) pulled back to the rest shape, m, body axes.

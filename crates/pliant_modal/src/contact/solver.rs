@@ -162,7 +162,9 @@ impl Touching {
                 end += 3 * self.spans[member].width;
                 Side { member, rows }
             };
-            self.sides.push([Some(side(point.member)), point.far.map(|far| side(far.member))]);
+            let probe = point.probe.map(|probe| probe.span).filter(|span| *span != point.member);
+            let other = point.far.map(|far| far.member).or(probe);
+            self.sides.push([Some(side(point.member)), other.map(side)]);
         }
         self.rows.clear();
         self.rows.resize(end, 0.0);
@@ -192,7 +194,8 @@ impl Touching {
         let (mut rigid, mut modal) = (0.0, 0.0);
         for span in &self.spans {
             for (k, x) in self.sum[span.start..][..span.width].iter().enumerate() {
-                let part = if k + 6 < span.width { &mut modal } else { &mut rigid };
+                // The spring of a probe is no rigid body.
+                let part = if k + 6 < span.width || span.width < 6 { &mut modal } else { &mut rigid };
                 *part += x * x;
             }
         }

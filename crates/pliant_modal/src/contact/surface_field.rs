@@ -12,7 +12,7 @@ const CARRIERS: usize = 4;
 pub(crate) const MAX_CARRIERS: usize = 3 * CARRIERS;
 
 /// Cosine of the angle between two triangles above which the surface is smooth between them.
-const SMOOTH: f64 = 0.7;
+pub(super) const SMOOTH: f64 = 0.7;
 
 /// Largest cosine between the outward normals of a site and of a triangle that it may touch.
 const FACING: f64 = -0.2;

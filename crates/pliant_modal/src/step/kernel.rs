@@ -471,9 +471,10 @@ impl Kernel {
         self.check_step(state, hands)?;
         let mut work = std::mem::take(&mut contacts.touching);
         let mut report = StepReport::default();
+        let step = self.h;
         let mut alone =
             [Alone(Parts { kernel: self, state, hands, load: *load, contacts, report: &mut report })];
-        let stepped = group::step(&mut alone, &[0], &[], &mut [], &mut work);
+        let stepped = group::step(&mut alone, &[0], &[], &mut [], (&mut [], &[], step), &mut work);
         contacts.touching = work;
         if let Err(StepError::Diverged { .. }) = stepped {
             contacts.forget();

@@ -12,7 +12,7 @@ use super::{
     touch::{RowsOfSide, take},
 };
 use crate::{
-    StepError,
+    Probe, StepError,
     contact::{
         Contact, ContactReport, ContactSites, Contacts, Memory, Point, Shape, Sixes, Touched, Touching,
     },
@@ -90,13 +90,17 @@ pub(super) struct Group<'a, P> {
     /// The six numbers of the sites of each member, at the beginning and at the end of the step.
     /// Empty for a body alone.
     pub(super) sixes: &'a mut [[Sixes; 2]],
+    /// All probes, and the indices of those that touch the members.
+    pub(super) probes: &'a mut [Probe],
+    pub(super) held: &'a [usize],
     /// Size of the smallest member, m.
     pub(super) size: f64,
     pub(super) h: f64,
 }
 
 /// Performs one step of the members `who`, which have the same step length. `pairs` has those that
-/// may touch each other, as indices into `who`.
+/// may touch each other, as indices into `who`. The probes `held` have begun their step of `h`
+/// seconds.
 ///
 /// # Errors
 /// Returns the error of an obstacle, or [`StepError::Diverged`] if the result of one member would
@@ -106,9 +110,15 @@ pub(crate) fn step<P: Member>(
     who: &[usize],
     pairs: &[[u32; 2]],
     sixes: &mut [[Sixes; 2]],
+    (probes, held, h): (&mut [Probe], &[usize], f64),
     work: &mut Touching,
 ) -> Result<(), StepError> {
-    let mut group = Group { all, who, pairs, sixes, size: f64::INFINITY, h: 0.0 };
+    let mut group = Group { all, who, pairs, sixes, probes, held, size: f64::INFINITY, h };
+    for &probe in held {
+        let probe = &mut group.probes[probe];
+        probe.contacts.clear();
+        group.size = group.size.min(2.0 * probe.config().radius);
+    }
     for member in 0..who.len() {
         let parts = group.parts(member);
         parts.kernel.before.clone_from(parts.state);
@@ -128,6 +138,7 @@ pub(crate) fn step<P: Member>(
             parts.contacts.list.clear();
             parts.contacts.report = ContactReport::default();
         }
+        held.iter().for_each(|&probe| group.probes[probe].forget());
         return Err(error);
     }
     Ok(())
@@ -142,7 +153,7 @@ impl<P: Member> Group<'_, P> {
         self.all[self.who[member]].view()
     }
 
-    fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         self.who.len()
     }
 
@@ -210,11 +221,11 @@ impl<P: Member> Group<'_, P> {
     fn step(&mut self, work: &mut Touching) -> Result<(), StepError> {
         work.points.clear();
         work.sweeps = 0;
-        let mut most_sites = 0;
+        let (mut most_sites, touched) = (0, !self.held.is_empty());
         for member in 0..self.len() {
             let alone = self.len() == 1;
             let Parts { kernel, contacts, .. } = self.parts(member);
-            if alone && contacts.obstacles().is_empty() {
+            if alone && !touched && contacts.obstacles().is_empty() {
                 contacts.memory.clear();
                 self.advance(work, 0.5);
                 return Ok(());
@@ -235,6 +246,7 @@ impl<P: Member> Group<'_, P> {
         let held = |view: View<'_>| (!view.contacts.memory.is_empty()).then_some(view.contacts.theta);
         let mut theta = (0..self.len()).filter_map(|member| held(self.view(member))).reduce(f64::max);
         points::begin(self, work)?;
+        points::begin_probes(self, work)?;
         let known = work.points.len();
         let mut report = self.attempt(work, &mut theta, true)?;
         if !work.points.is_empty() && gained(work, true) {
@@ -243,6 +255,7 @@ impl<P: Member> Group<'_, P> {
             theta = Some(1.0);
             let rounds = report.rounds;
             points::begin(self, work)?;
+            points::begin_probes(self, work)?;
             report = self.attempt(work, &mut theta, false)?;
             report.rounds += rounds;
             report.guarded = true;
@@ -276,6 +289,7 @@ impl<P: Member> Group<'_, P> {
             if let Some(sites) = contacts.places.as_deref() {
                 for point in &work.points {
                     let near = point.member == member;
+                    let held = point.probe.as_ref().and_then(|probe| probe.first.as_ref());
                     let far = point.far.as_ref().filter(|far| far.member == member);
                     if !near && far.is_none() {
                         continue;
@@ -288,6 +302,9 @@ impl<P: Member> Group<'_, P> {
                     if let Some(far) = far {
                         let tangent = far.mean.unwrap_or(far.tangent);
                         kernel.add_push(sites, far.carriers.iter(), &tangent, &far.arm, &-force);
+                    } else if let Some((_, carriers)) = held {
+                        let tangent = point.mean.unwrap_or(point.tangent);
+                        kernel.add_push(sites, carriers.iter(), &tangent, &point.arm, &force);
                     } else {
                         let tangent = point.mean.unwrap_or(point.tangent);
                         let site = std::iter::once((point.site, 1.0));
@@ -297,6 +314,16 @@ impl<P: Member> Group<'_, P> {
             }
             *report = kernel.advance(state, hands, &load);
             kernel.push.is_on = false;
+        }
+        for &index in self.held {
+            let mut sum = Vector3::zeros();
+            for point in &work.points {
+                if let Some(at) = point.probe.as_ref().filter(|at| at.probe == index) {
+                    let force = point.world_force();
+                    sum += if at.first.is_some() { -force } else { force };
+                }
+            }
+            self.probes[index].settle(&sum);
         }
     }
 
@@ -320,7 +347,8 @@ impl<P: Member> Group<'_, P> {
                 return Ok(report);
             }
             let band = if round == 1 { BAND * self.size } else { 0.0 };
-            let (new, candidates) = points::detect(self, work, band)?;
+            let (mut new, candidates) = points::detect(self, work, band)?;
+            new |= points::detect_probes(self, work)?;
             report.candidates += candidates;
             points::linearize(self, work, recovers)?;
             report.residual = work.violation();
@@ -345,7 +373,8 @@ impl<P: Member> Group<'_, P> {
 
     /// Writes the rows of all points.
     fn fill_rows(&self, work: &mut Touching) {
-        work.lay_out((0..self.len()).map(|member| self.view(member).kernel.modes() + 6));
+        let bodies = (0..self.len()).map(|member| self.view(member).kernel.modes() + 6);
+        work.lay_out(bodies.chain(self.held.iter().map(|_| 3)));
         work.lay_out_rows();
         for member in 0..self.len() {
             let view = self.view(member);
@@ -359,7 +388,12 @@ impl<P: Member> Group<'_, P> {
                     let tangent = point.mean.unwrap_or(point.tangent);
                     let of = RowsOfSide { axes: point.axes, tangent, arm: point.arm, spin: spin.as_ref() };
                     let rows = &mut work.rows[side.rows..][..3 * width];
-                    view.kernel.fill_rows(sites, std::iter::once((point.site, 1.0)), &of, rows);
+                    match point.probe.as_ref().and_then(|probe| probe.first.as_ref()) {
+                        Some((_, carriers)) => view.kernel.fill_rows(sites, carriers.iter(), &of, rows),
+                        None => {
+                            view.kernel.fill_rows(sites, std::iter::once((point.site, 1.0)), &of, rows);
+                        }
+                    }
                 }
                 if let (Some(far), Some(side)) = (&point.far, &sides[1])
                     && far.member == member
@@ -369,6 +403,18 @@ impl<P: Member> Group<'_, P> {
                     let rows = &mut work.rows[side.rows..][..3 * width];
                     view.kernel.fill_rows(sites, far.carriers.iter(), &of, rows);
                 }
+            }
+        }
+        for (point, sides) in work.points.iter().zip(&work.sides) {
+            let Some(at) = &point.probe else { continue };
+            // The force is on the probe at an obstacle, and against it at a body. Squares of the
+            // rows are the compliance of its spring.
+            let (side, sign) = if at.first.is_some() { (sides[1], -1.0) } else { (sides[0], 1.0) };
+            let Some(side) = side else { continue };
+            let root = sign * self.probes[at.probe].compliance.sqrt();
+            for axis in 0..3 {
+                let row = &mut work.rows[side.rows + 3 * axis..][..3];
+                row.iter_mut().zip(&point.axes.row(axis)).for_each(|(x, axis)| *x = root * axis);
             }
         }
     }
@@ -401,6 +447,10 @@ impl<P: Member> Group<'_, P> {
             return false;
         }
         let (mut moving, mut gained, mut scale, mut lost, mut slow) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        // A probe does the work of a hand.
+        if work.points.iter().any(|point| point.probe.is_some() && point.pushed[0] > 0.0) {
+            return false;
+        }
         let mut grounded = work.points.iter().any(|point| point.far.is_none() && point.pushed[0] > 0.0);
         for member in 0..self.len() {
             let View { kernel, state, hands, load, contacts } = self.view(member);
@@ -535,10 +585,19 @@ impl<P: Member> Group<'_, P> {
             let other = match point.other {
                 Touched::Obstacle(index) => (0, index as u64),
                 Touched::Body(key) => (1, key),
+                Touched::Probe(index) => (2, index as u64),
             };
             (point.member, other, point.site)
         });
+        for &probe in self.held {
+            self.probes[probe].memory.clear();
+        }
         for point in &work.points {
+            if let Some((probe, contact, memory)) = points::keep_at_probe(self, point) {
+                let probe = &mut self.probes[probe];
+                probe.contacts.push(contact);
+                probe.memory.extend(memory);
+            }
             let force = point.world_force();
             if point.pushed[0] <= 0.0 || !force.iter().all(|x| x.is_finite()) {
                 continue;
@@ -555,27 +614,43 @@ impl<P: Member> Group<'_, P> {
 
     /// Keeps a contact with force for the next step, and lists it at both bodies.
     fn keep(&mut self, point: &Point, force: &Vector3<f64>) {
-        let view = self.view(point.member);
-        let key = view.contacts.key;
-        let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { return };
-        let dent = point.compliance * force;
         let held = point.pushed[1].hypot(point.pushed[2]);
         let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
-        let mut anchor = if sliding { point.end + dent } else { point.anchor };
-        // The next step holds the material of the new contact point.
-        anchor += point.place - point.end;
-        let toward = if site.radius > 0.0 { point.last } else { point.first };
         let normal = point.axes.row(0).transpose();
+        let dent = point.compliance * force;
         let penetration = (-(point.off[0] + point.floor + normal.dot(&dent))).max(0.0);
-        let contact = Contact {
+        let add = |contacts: &mut Contacts, contact: Contact, compliance: &Matrix3<f64>| {
+            let report = &mut contacts.report;
+            report.force = (Vector3::from(report.force) + Vector3::from(contact.force)).into();
+            report.penetration = report.penetration.max(penetration);
+            report.energy += 0.5 * force.dot(&(compliance * force));
+            contacts.list.push(contact);
+        };
+        let mut contact = Contact {
             other: point.other,
-            vertex: site.vertex,
+            vertex: 0,
             point: point.place.into(),
             normal: normal.into(),
             force: (*force).into(),
             penetration,
             sliding,
         };
+        if let Some(at) = &point.probe {
+            let Some((_, carriers)) = &at.first else { return };
+            let sites = self.view(point.member).sites();
+            let site = carriers.largest().and_then(|site| sites?.sites.get(site));
+            contact.vertex = site.map_or(0, |site| site.vertex);
+            add(self.parts(point.member).contacts, contact, &point.compliance);
+            return;
+        }
+        let view = self.view(point.member);
+        let key = view.contacts.key;
+        let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { return };
+        let mut anchor = if sliding { point.end + dent } else { point.anchor };
+        // The next step holds the material of the new contact point.
+        anchor += point.place - point.end;
+        let toward = if site.radius > 0.0 { point.last } else { point.first };
+        contact.vertex = site.vertex;
         let far = point.far.as_ref().map(|far| {
             let view = self.view(far.member);
             let turn = view.state.frame.rotation().inverse();
@@ -588,13 +663,6 @@ impl<P: Member> Group<'_, P> {
         });
         let (anchor, vertex) = far.unwrap_or((anchor, 0));
         let own = point.compliance - point.far.map_or_else(Matrix3::zeros, |far| far.compliance);
-        let add = |contacts: &mut Contacts, contact: Contact, compliance: &Matrix3<f64>| {
-            let report = &mut contacts.report;
-            report.force = (Vector3::from(report.force) + Vector3::from(contact.force)).into();
-            report.penetration = report.penetration.max(penetration);
-            report.energy += 0.5 * force.dot(&(compliance * force));
-            contacts.list.push(contact);
-        };
         let contacts = self.parts(point.member).contacts;
         let place = point.far.map(|far| far.place);
         let (other, site) = (point.other, point.site);

@@ -9,18 +9,21 @@ use super::{
 use crate::{
     StepError,
     contact::{
-        ContactSites, Far, Guess, Near, ObstacleShape, Place, Shape, Site, SurfacePoint, Touched, Touching,
+        Carriers, ContactSites, Far, Guess, Near, ObstacleShape, Place, Shape, Site, SurfacePoint, Touched,
+        Touching,
     },
-    step::{State, Tangent},
+    step::{Frame, State, Tangent},
 };
 
 mod begin;
 mod detect;
 mod pass;
+mod probes;
 
 pub(super) use begin::begin;
 pub(super) use detect::detect;
 use pass::march;
+pub(super) use probes::{begin_probes, detect_probes, keep_at_probe};
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
 const RECOVERED: f64 = 0.2;
@@ -70,8 +73,18 @@ fn friction(a: &View<'_>, b: &View<'_>) -> f64 {
 
 /// Compliance of a place of another body, m/N, world axes.
 fn far_compliance(view: &View<'_>, sites: &ContactSites, state: &State, far: &Far) -> Matrix3<f64> {
-    let site = far.carriers.largest().and_then(|site| sites.sites.get(site));
-    site.map_or_else(Matrix3::zeros, |site| view.kernel.site_compliance(site, &state.frame, &state.q))
+    carrier_compliance(view, sites, (&state.frame, &state.q), &far.carriers)
+}
+
+/// Compliance of a place of a body at a frame and coordinates, m/N, world axes.
+fn carrier_compliance(
+    view: &View<'_>,
+    sites: &ContactSites,
+    (frame, q): (&Frame, &[f64]),
+    carriers: &Carriers,
+) -> Matrix3<f64> {
+    let site = carriers.largest().and_then(|site| sites.sites.get(site));
+    site.map_or_else(Matrix3::zeros, |site| view.kernel.site_compliance(site, frame, q))
 }
 
 /// The side at another body as it is before a first look at the end of the step.
@@ -126,6 +139,10 @@ pub(super) fn linearize<P: Member>(
     recovers: bool,
 ) -> Result<(), StepError> {
     for point in &mut work.points {
+        if point.probe.is_some() {
+            probes::linearize_at_probe(group, point, recovers)?;
+            continue;
+        }
         let view = group.view(point.member);
         let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { continue };
         let (kernel, state) = (view.kernel, view.state);
@@ -172,7 +189,7 @@ pub(super) fn linearize<P: Member>(
                 point.turn(&near.normal);
                 (located, near.distance)
             }
-            (Touched::Body(_), None) => continue,
+            (Touched::Body(_), None) | (Touched::Probe(_), _) => continue,
         };
         point.floor = floor(point.gap, RECOVERY_SPEED * size * group.h, recovers);
         point.last = located.toward;

@@ -167,7 +167,7 @@ impl Kernel {
     }
 
     /// The body at a state, as something that other bodies touch.
-    pub(super) fn shape<'a>(
+    pub(crate) fn shape<'a>(
         &'a self,
         sites: &'a ContactSites,
         state: &'a State,

@@ -14,7 +14,7 @@ use crate::{
 
 /// Farthest distance of a site's surface from its anchor, as a share of the body's size. Beyond it
 /// the body was moved from elsewhere.
-const SNAPPED: f64 = 0.02;
+pub(super) const SNAPPED: f64 = 0.02;
 
 /// Sets up the contacts that the step before left.
 pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touching) -> Result<(), StepError> {
@@ -25,6 +25,7 @@ pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touchi
         for memory in &view.contacts.memory {
             let Some(site) = sites.sites.get(memory.site) else { continue };
             match memory.other {
+                Touched::Probe(_) => {}
                 Touched::Obstacle(index) => {
                     let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
                     work.points.push(begin_at_obstacle(member, &view, memory, site, &**obstacle)?);

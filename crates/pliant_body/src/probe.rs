@@ -1,0 +1,177 @@
+//! Probes: balls that press and stroke bodies without gripping.
+
+use std::sync::Arc;
+
+use bevy::{math::DVec3, prelude::*};
+use pliant_modal::{Contacts, ObstacleShape, Probe, ProbeConfig, ProbeContact, StepError, Touched};
+
+/// A ball that a hand holds by a spring, and that presses and strokes every body here
+/// ([`Driven::Local`](crate::Driven::Local)) and, with the contact plugin, every obstacle.
+///
+/// The ball stays on the surface while its target goes in. It touches bodies of one scale at a
+/// time: that of the body whose center is nearest. What it touches is in [`ProbeState`].
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Debug, Clone, PartialEq)]
+#[require(ProbeState)]
+pub struct TouchProbe {
+    /// Radius of the ball, m, above 0. Default: `0.01`.
+    pub radius: f64,
+    /// Where the spring pulls the center of the ball, m, world axes.
+    pub target: DVec3,
+    /// Stiffness of the spring, N/m, above 0. Default: `500`.
+    pub stiffness: f64,
+    /// Relaxation time of the damper beside the spring, s, 0 or more. Default: `0.001`.
+    pub relaxation: f64,
+    /// Coefficient of friction, 0 to 10. At a body the geometric mean with that of the body counts.
+    /// Default: `0.5`.
+    pub friction: f64,
+    /// Whether the ball touches anything. Default: `true`.
+    pub enabled: bool,
+}
+
+impl Default for TouchProbe {
+    fn default() -> Self {
+        Self {
+            radius: 0.01,
+            target: DVec3::ZERO,
+            stiffness: 500.0,
+            relaxation: 1e-3,
+            friction: Contacts::FRICTION,
+            enabled: true,
+        }
+    }
+}
+
+/// Something that a probe touches, or that is less than a radius away from it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Touching {
+    /// The body or the obstacle.
+    pub other: Entity,
+    /// The nearest point of the surface, m, world axes, without the dent which the modes leave out.
+    pub point: DVec3,
+    /// Outward normal of what is touched.
+    pub normal: DVec3,
+    /// Velocity of the surface, m/s, world axes.
+    pub velocity: DVec3,
+    /// Compliance of the dent, m/N, world axes.
+    pub compliance: [[f64; 3]; 3],
+    /// Coefficient of friction.
+    pub friction: f64,
+    /// Mean force on the ball over the last step, N, world axes. Zero where nothing touches.
+    pub force: DVec3,
+    /// Whether the contact slides.
+    pub sliding: bool,
+}
+
+/// State of a [`TouchProbe`] after the last step.
+#[derive(Component, Debug, Default)]
+pub struct ProbeState {
+    /// The solver's probe. `None` while it touches nothing, or was refused.
+    probe: Option<Probe>,
+    /// Scale of the bodies that it touches.
+    scale: f64,
+    obstacles: Vec<Entity>,
+    /// Whether the settings were refused, so that it is told once.
+    refused: bool,
+}
+
+impl ProbeState {
+    /// Center of the ball, m, world axes. `None` while the probe touches nothing.
+    pub fn position(&self) -> Option<DVec3> {
+        Some(DVec3::from(self.probe.as_ref()?.position()) * self.scale)
+    }
+
+    /// Force on the ball over the last step, N, world axes.
+    pub fn force(&self) -> DVec3 {
+        self.probe.as_ref().map_or(DVec3::ZERO, |probe| DVec3::from(probe.force()) * self.scale)
+    }
+
+    /// What the ball touches, and what is near it.
+    pub fn contacts(&self) -> impl Iterator<Item = Touching> + '_ {
+        let scale = self.scale;
+        let contacts = self.probe.as_ref().map_or(&[][..], Probe::contacts);
+        contacts.iter().filter_map(move |contact: &ProbeContact| {
+            let other = match contact.other {
+                Touched::Obstacle(index) => *self.obstacles.get(index)?,
+                Touched::Body(bits) => Entity::try_from_bits(bits)?,
+                Touched::Probe(_) => return None,
+            };
+            Some(Touching {
+                other,
+                point: DVec3::from(contact.point) * scale,
+                normal: contact.normal.into(),
+                velocity: DVec3::from(contact.velocity) * scale,
+                // Lengths and forces have the same factor.
+                compliance: contact.compliance,
+                friction: contact.friction,
+                force: DVec3::from(contact.force) * scale,
+                sliding: contact.sliding,
+            })
+        })
+    }
+
+    /// Center (m, world axes) around which obstacles count, and the scale of their shapes.
+    pub fn around(&self) -> Option<(DVec3, f64)> {
+        Some((self.position()?, self.scale))
+    }
+
+    /// The obstacles that the ball was given.
+    pub fn obstacles(&self) -> &[Entity] {
+        &self.obstacles
+    }
+
+    /// Gives the ball its obstacles, in lengths of [`around`](Self::around)'s scale.
+    ///
+    /// # Errors
+    /// Returns the error of [`Probe::set_obstacles`]. The old obstacles then stay.
+    pub fn set_obstacles(&mut self, list: Vec<(Entity, Arc<dyn ObstacleShape>)>) -> Result<(), StepError> {
+        let (entities, shapes) = list.into_iter().unzip();
+        if let Some(probe) = &mut self.probe {
+            probe.set_obstacles(shapes)?;
+            self.obstacles = entities;
+        }
+        Ok(())
+    }
+
+    pub(crate) fn scale(&self) -> f64 {
+        self.scale
+    }
+
+    /// Takes the probe for a step, led to its target.
+    pub(crate) fn take(&mut self, wanted: &TouchProbe, scale: f64) -> Result<Option<Probe>, StepError> {
+        if !wanted.enabled {
+            (self.probe, self.refused) = (None, false);
+            self.obstacles.clear();
+            return Ok(None);
+        }
+        let config = ProbeConfig {
+            radius: wanted.radius / scale,
+            stiffness: wanted.stiffness,
+            relaxation: wanted.relaxation,
+            friction: wanted.friction,
+        };
+        let target = (wanted.target / scale).into();
+        let known = self.probe.take().filter(|_| self.scale == scale);
+        let taken = match known {
+            Some(mut probe) => {
+                probe.configure(config).and_then(|()| probe.set_target(target)).map(|()| probe)
+            }
+            None => {
+                self.obstacles.clear();
+                Probe::new(config, target)
+            }
+        };
+        self.scale = scale;
+        let first = !std::mem::replace(&mut self.refused, taken.is_err());
+        match taken {
+            Ok(probe) => Ok(Some(probe)),
+            Err(error) if first => Err(error),
+            Err(_) => Ok(None),
+        }
+    }
+
+    /// Gives the probe back after the step.
+    pub(crate) fn give(&mut self, probe: Probe) {
+        self.probe = Some(probe);
+    }
+}
