@@ -165,8 +165,8 @@ pub mod prelude {
     pub use crate::body::{
         BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed, Grabs, Impulse, Inertia,
         Integrator, ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems,
-        PliantSystems, PliantTick, Push, Relaxation, Released, RideOn, RidingPlugin, SingleSteps,
-        StepSettings, SurfaceAnchor, SurfacePlace, Teleport, VisualState,
+        PliantSystems, PliantTick, ProbeState, Push, Relaxation, Released, RideOn, RidingPlugin, SingleSteps,
+        StepSettings, SurfaceAnchor, SurfacePlace, Teleport, TouchProbe, VisualState,
     };
     #[cfg(feature = "render")]
     pub use crate::body::{PliantGizmos, SurfaceDeformation, SurfaceDetail, SurfaceShading};
@@ -182,7 +182,7 @@ pub mod prelude {
     #[cfg(feature = "haptics")]
     pub use crate::haptics::{
         HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool, HapticsPlugin, ToolGrabs,
-        ToolGrip, ToolOffset, ToolPose,
+        ToolGrip, ToolOffset, ToolPose, ToolTouch,
     };
     pub use crate::modal::{ModalModel, Patch};
 }

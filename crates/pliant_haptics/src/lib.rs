@@ -63,7 +63,8 @@ pub use control_loop::cycle::{Cycle, LoopEvent, LoopReport, LoopState, Record, S
 pub use control_loop::histogram::Histogram;
 pub use control_loop::local_body::ModalLocal;
 pub use control_loop::local_model::{
-    HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter, PublishedGrab, ToolContact,
+    HeldGrab, LocalModel, MAX_CONTACTS, MAX_PLANES, ModelWriter, PublishedGrab, ToolContact, TouchBall,
+    TouchPlane,
 };
 pub use control_loop::runner::{HapticLoop, StopSwitch};
 pub use control_loop::scheduler::{LoopClock, RealScheduler, VirtualScheduler};
@@ -87,7 +88,7 @@ pub use plugin::GamepadSource;
 pub use plugin::{
     DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticSystems,
     HapticTool, HapticsPlugin, HeldBy, PointerSource, PointerToolSystems, ToolGrabs, ToolGrip, ToolOffset,
-    ToolPose,
+    ToolPose, ToolTouch,
 };
 #[cfg(feature = "rumble")]
 pub use plugin::{GamepadVibration, Rumble, ToolRumble};

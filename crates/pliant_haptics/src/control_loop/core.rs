@@ -9,6 +9,7 @@ use crate::{
     SafetyConfig, SafetyError, Sample, ToolMap, Wanted, Wrench,
     control_loop::held_patches::{Change, HeldPatches, PatchForces, When},
     control_loop::tool::{Tool, masked},
+    control_loop::touch::Touch,
     control_loop::validation::{Believed, SampleValidation},
     safety::{Slew, clamp_magnitude},
 };
@@ -152,6 +153,7 @@ pub struct LoopCore {
     safety: Safety,
     torque: Slew,
     held: HeldPatches,
+    touch: Touch,
     /// The last local model update: its tick, its time of arrival, the energy that others had
     /// supplied, and whether it was finite.
     received_tick: u64,
@@ -201,6 +203,7 @@ impl LoopCore {
             safety: Safety::new(safety, info.mass),
             torque: Slew::default(),
             held: HeldPatches::new(safety.ramp),
+            touch: Touch::default(),
             received_tick: 0,
             received_at: 0.0,
             supplied: 0.0,
@@ -318,8 +321,10 @@ impl LoopCore {
         if !self.good {
             fault = fault.or(Some(Fault::BadModel));
         }
-        let holding = self.good && self.received_tick > 0 && model.count > 0;
-        let silent = if holding { (now - self.received_at).max(0.0) } else { 0.0 };
+        let fresh = self.good && self.received_tick > 0;
+        let mut holding = fresh && model.count > 0;
+        let touching = fresh && !holding && model.plane_count > 0;
+        let silent = if holding || touching { (now - self.received_at).max(0.0) } else { 0.0 };
 
         let forces = if holding {
             let when = When { now, dt, period: 1.0 / self.config.rate };
@@ -327,6 +332,16 @@ impl LoopCore {
         } else {
             self.held.rest();
             PatchForces::default()
+        };
+        let forces = if touching {
+            let touched = self.touch.forces(now, dt.min(2.0 / self.config.rate), &self.tool, model);
+            // In free air the energy of the port begins anew.
+            holding = self.touch.touches();
+            let stored = touched.stored + model.stored;
+            PatchForces { elastic: touched.elastic, damping: touched.damping, stored, ..forces }
+        } else {
+            self.touch.rest();
+            forces
         };
         let scale = self.tool.energy_scale();
         let axes = self.info.force_axes;
@@ -348,6 +363,7 @@ impl LoopCore {
             partial: model.partial,
             supplied: scale * supplied,
             growing: forces.growing,
+            one_sided: touching,
             holding,
             silent,
             interval: model.interval,

@@ -31,6 +31,38 @@ pub struct ToolContact {
     pub reaction: [f64; 3],
 }
 
+/// Maximum number of planes that a tool touches at once.
+pub const MAX_PLANES: usize = 6;
+
+/// A plane that the tool's ball touches or is near: the surface of a body or of an obstacle.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TouchPlane {
+    /// Key of what is touched, unique for as long as it is near.
+    pub key: u64,
+    /// A point of the surface, m, world axes. The dent is not in it.
+    pub point: [f64; 3],
+    /// Outward normal, unit length, world axes.
+    pub normal: [f64; 3],
+    /// Velocity of the surface, m/s, world axes.
+    pub velocity: [f64; 3],
+    /// Compliance of the dent, m/N, world axes, symmetric.
+    pub compliance: [[f64; 3]; 3],
+    /// Coefficient of friction, 0 or more.
+    pub friction: f64,
+}
+
+/// The ball with which a tool touches, at the tool point.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TouchBall {
+    /// Radius, m of the world.
+    pub radius: f64,
+    /// Stiffness of the spring from the tool to the ball, N/m of the world. With 0 it touches
+    /// nothing.
+    pub stiffness: f64,
+    /// Relaxation time of the damper beside the spring, s.
+    pub relaxation: f64,
+}
+
 /// The local model of one simulation step. It is overwritten in place once per step, so that
 /// neither side allocates.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -49,6 +81,12 @@ pub struct LocalModel {
     pub contacts: [ToolContact; MAX_CONTACTS],
     /// Number of grabs that the tool holds.
     pub count: usize,
+    /// The tool's ball, and the planes that it may touch. The first `plane_count` are in use.
+    pub ball: TouchBall,
+    /// See [`ball`](Self::ball).
+    pub planes: [TouchPlane; MAX_PLANES],
+    /// Number of planes.
+    pub plane_count: usize,
     /// Energy that the body could give back, elastic and kinetic, J.
     pub stored: f64,
     /// Whether `stored` is only a lower bound. Of a body that is stepped elsewhere, only the shape
@@ -68,6 +106,11 @@ impl LocalModel {
         &self.contacts[..self.count.min(MAX_CONTACTS)]
     }
 
+    /// Returns the planes in use.
+    pub fn planes(&self) -> &[TouchPlane] {
+        &self.planes[..self.plane_count.min(MAX_PLANES)]
+    }
+
     /// Creates a model with room for the state of `body`, so that the first write does not allocate
     /// either.
     pub fn sized_for(body: &Body) -> Self {
@@ -78,7 +121,16 @@ impl LocalModel {
     /// Returns whether no scalar and no contact in use contains a NaN or an infinity.
     pub fn is_finite(&self) -> bool {
         let scalars = [self.stamp, self.period, self.interval, self.stored, self.supplied];
-        scalars.iter().all(|x| x.is_finite())
+        let ball = [self.ball.radius, self.ball.stiffness, self.ball.relaxation];
+        scalars.iter().chain(&ball).all(|x| x.is_finite())
+            && self.planes().iter().all(|p| {
+                let vectors = [p.point, p.normal, p.velocity];
+                let upright = (Vector3::from(p.normal).norm() - 1.0).abs() < 1e-6;
+                upright
+                    && p.friction >= 0.0
+                    && p.friction.is_finite()
+                    && vectors.iter().flatten().chain(p.compliance.iter().flatten()).all(|x| x.is_finite())
+            })
             && self.contacts().iter().all(|c| {
                 let vectors = [c.offset, c.proxy, c.velocity, c.reaction];
                 c.damping.is_finite()
@@ -164,7 +216,7 @@ impl ModelWriter {
         out.tick = self.tick;
         out.stamp = stamp;
         out.period = body.config().step;
-        out.count = 0;
+        (out.count, out.plane_count) = (0, 0);
         out.stored = body.energy() * scale * scale;
         out.partial = false;
         self.stored = None;
@@ -212,6 +264,32 @@ impl ModelWriter {
         Ok(())
     }
 
+    /// Writes what a tool that holds nothing touches. `stored` is the energy of the touched bodies,
+    /// J of the world, and `period` the time of a step, s. Planes beyond [`MAX_PLANES`] are left
+    /// out.
+    pub fn write_touch(
+        &mut self,
+        ball: TouchBall,
+        planes: impl Iterator<Item = TouchPlane>,
+        stored: f64,
+        period: f64,
+        stamp: f64,
+        out: &mut LocalModel,
+    ) {
+        self.tick += 1;
+        (out.tick, out.stamp, out.period) = (self.tick, stamp, period);
+        (out.count, out.plane_count, out.ball) = (0, 0, ball);
+        for (slot, plane) in out.planes.iter_mut().zip(planes) {
+            *slot = plane;
+            out.plane_count += 1;
+        }
+        (self.proxies, self.points) = ([None; MAX_CONTACTS], [None; MAX_CONTACTS]);
+        (self.stored, self.potential) = (None, None);
+        out.stored = if stored.is_finite() { stored.max(0.0) } else { 0.0 };
+        (out.partial, out.supplied) = (false, self.supplied);
+        out.others.clear();
+    }
+
     /// Writes the same from published forces alone, for a body that is stepped elsewhere.
     ///
     /// - `relaxation`: relaxation time of the coupling's damper, s.
@@ -235,6 +313,7 @@ impl ModelWriter {
         out.stamp = stamp;
         out.period = period;
         out.count = published.len().min(MAX_CONTACTS);
+        out.plane_count = 0;
         let before = self.points;
         self.points = [None; MAX_CONTACTS];
         for (i, grab) in published.iter().take(MAX_CONTACTS).enumerate() {

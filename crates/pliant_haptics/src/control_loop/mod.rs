@@ -14,6 +14,7 @@ pub(crate) mod runner;
 pub(crate) mod scheduler;
 pub(crate) mod supervisor;
 pub(crate) mod tool;
+pub(crate) mod touch;
 pub(crate) mod validation;
 
 /// What threads share. Tests put loom's in its place.

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use bevy::{math::DVec3, prelude::*};
 use nalgebra::Matrix3;
-use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, VisualState};
+use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ProbeState, TouchProbe, VisualState};
 use pliant_modal::{BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
-use crate::{Coupling, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal, PublishedGrab};
+use crate::{Coupling, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal, PublishedGrab, TouchBall, TouchPlane};
 
 /// Number of missing states in a row after which a body that is stepped elsewhere counts as lost.
 const MISSING_STATES: f64 = 4.0;
@@ -140,7 +140,7 @@ pub(crate) fn publish(
     time: Res<Time>,
     simulated: Option<Res<Time<Virtual>>>,
     mut devices: ResMut<HapticDevices>,
-    tools: Query<(&HapticTool, Option<&ToolGrabs>)>,
+    tools: Query<(&HapticTool, Option<&ToolGrabs>, Option<(&TouchProbe, &ProbeState)>)>,
     grabs: HeldGrabs,
     bodies: Bodies,
 ) {
@@ -151,7 +151,7 @@ pub(crate) fn publish(
     }
     let speed = simulated.map_or(1.0, |time| f64::from(time.relative_speed()));
     let interval = if speed > 0.0 { period / speed } else { 0.0 };
-    for (tool, held) in &tools {
+    for (tool, held, touch) in &tools {
         let Some(entry) = devices.entry(tool.device) else { continue };
         let entities = held.map_or(&[][..], ToolGrabs::entities);
         let held: Vec<_> = entities.iter().filter_map(|&e| grabs.get(e).ok()).take(MAX_CONTACTS).collect();
@@ -169,6 +169,26 @@ pub(crate) fn publish(
             if let Some(error) = wrong {
                 warn!("{}: the hand was told of no contact: {error}", entry.status.info.name);
             }
+        } else if let Some((probe, state)) = touch.filter(|(probe, _)| probe.enabled) {
+            let ball =
+                TouchBall { radius: probe.radius, stiffness: probe.stiffness, relaxation: probe.relaxation };
+            let planes = state.contacts().map(|contact| TouchPlane {
+                key: contact.other.to_bits(),
+                point: contact.point.into(),
+                normal: contact.normal.into(),
+                velocity: contact.velocity.into(),
+                compliance: contact.compliance,
+                friction: contact.friction,
+            });
+            let stored = state.contacts().filter_map(|contact| {
+                let (state, ..) = bodies.get(contact.other).ok()?;
+                Some(state.body().energy() * state.scale() * state.scale())
+            });
+            let stored = stored.sum();
+            entry.running.get().publish(|model: &mut LocalModel| {
+                model.interval = interval;
+                writer.write_touch(ball, planes, stored, period, seen, model);
+            });
         } else if entry.elsewhere.is_alive(&held, &bodies, now) {
             entry.elsewhere.springs.retain(|(e, _)| entities.contains(e));
             let published: Vec<PublishedGrab> = held

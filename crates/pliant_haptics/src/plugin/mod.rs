@@ -46,7 +46,7 @@ pub use show::ForceArrow;
 #[cfg(feature = "gamepad")]
 pub use source::GamepadSource;
 pub use source::{PointerSource, PointerToolSystems};
-pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose};
+pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose, ToolTouch};
 
 /// The steps of the plugin in a tick, around [`PliantSystems`].
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
@@ -87,6 +87,7 @@ impl Plugin for HapticsPlugin {
             .register_type::<HapticTool>()
             .register_type::<ToolPose>()
             .register_type::<ToolGrip>()
+            .register_type::<ToolTouch>()
             .register_type::<ToolOffset>()
             .register_type::<HeldBy>()
             .register_type::<ToolGrabs>()
@@ -113,7 +114,10 @@ impl Plugin for HapticsPlugin {
                     .after(InputSystems)
                     .after(PickingSystems::Backend),
             )
-            .add_systems(self.schedule, tool::update_tools.in_set(HapticSystems::Move))
+            .add_systems(
+                self.schedule,
+                (tool::update_tools, tool::lead_balls).chain().in_set(HapticSystems::Move),
+            )
             .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::LocalModel));
         #[cfg(feature = "gamepad")]
         app.add_systems(PreUpdate, source::steer.after(tool::grip).after(InputSystems));

@@ -4,11 +4,14 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_body::{BodyState, Driven, Grab, GrabOf, VisualState};
+use pliant_body::{BodyState, Driven, Grab, GrabOf, TouchProbe, VisualState};
 use pliant_modal::Patch;
 
 use super::{DeviceId, HapticButton, HapticDevices};
 use crate::ToolMap;
+
+/// Stiffness of the spring of a ball whose coupling has no limit, N/m.
+const STIFFEST: f64 = 1e5;
 
 /// The tool of a device.
 ///
@@ -65,6 +68,27 @@ impl HapticTool {
             mass: self.mass,
             clutch: self.clutch,
         }
+    }
+}
+
+/// Lets a tool touch bodies and obstacles with a ball at the tool point while it holds nothing.
+///
+/// The plugin adds a [`TouchProbe`] to the tool's entity and writes it.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Clone, PartialEq)]
+#[require(TouchProbe { enabled: false, ..default() })]
+pub struct ToolTouch {
+    /// Radius of the ball, m of the world, above 0. Default: `0.01`.
+    pub radius: f64,
+    /// Coefficient of friction, 0 to 10. At a body the geometric mean with that of the body counts.
+    /// Default: `0.5`.
+    pub friction: f64,
+}
+
+impl Default for ToolTouch {
+    fn default() -> Self {
+        let TouchProbe { radius, friction, .. } = TouchProbe::default();
+        Self { radius, friction }
     }
 }
 
@@ -182,6 +206,28 @@ pub(crate) fn update_tools(
             let wanted = Grab { target, stiffness: config.stiffness, relaxation: config.relaxation, ..*grab };
             grab.set_if_neq(wanted);
         }
+    }
+}
+
+/// Before a tick: leads the balls of the tools that touch.
+pub(crate) fn lead_balls(
+    devices: Res<HapticDevices>,
+    mut tools: Query<(&HapticTool, &ToolPose, &ToolTouch, Option<&ToolGrabs>, &mut TouchProbe)>,
+) {
+    for (tool, pose, touch, held, mut probe) in &mut tools {
+        let coupling = devices.get(tool.device).map(|status| status.coupling);
+        let spring = coupling.map(|c| c.grab_config(tool.motion_scale, tool.force_scale));
+        // Without a limit the coupling is infinite. A probe needs a spring.
+        let stiffness = spring.map_or(0.0, |spring| spring.stiffness.unwrap_or(STIFFEST));
+        let holds = held.is_some_and(|held| !held.entities().is_empty());
+        probe.set_if_neq(TouchProbe {
+            radius: touch.radius,
+            target: pose.position,
+            stiffness,
+            relaxation: spring.map_or(0.0, |spring| spring.relaxation),
+            friction: touch.friction,
+            enabled: stiffness > 0.0 && !holds,
+        });
     }
 }
 

@@ -199,7 +199,9 @@ pub struct Wanted {
     /// Whether springs are engaging by ramps of their own. Energy that such a spring stores while
     /// the hand does not feel its force has not leaked.
     pub growing: bool,
-    /// Whether the tool holds something.
+    /// Whether the tool only touches, so that nothing may pull the hand against the wanted force.
+    pub one_sided: bool,
+    /// Whether the tool holds or touches something.
     pub holding: bool,
     /// Time since the last local model update, s.
     pub silent: f64,
@@ -323,7 +325,16 @@ impl Safety {
         let (mut elastic, mut damping) = (w.elastic, w.damping);
         let slew = self.slew_rate();
         if self.config.passivity.is_some() {
+            let wanted = elastic + damping;
             damping += self.passivity.dissipate(&w.velocity, w.dt);
+            if w.one_sided {
+                // The controller may take away what pushes, but it may not pull.
+                let push = wanted.try_normalize(f64::MIN_POSITIVE).unwrap_or_else(Vector3::zeros);
+                damping -= push * (elastic + damping).dot(&push).min(0.0);
+                if push == zero {
+                    damping = zero;
+                }
+            }
             if let Some(limit) = self.config.max_damping {
                 damping = cap_damping(&damping, &w.velocity, limit);
             }

@@ -19,6 +19,7 @@ fn wanted(force: f64) -> Wanted {
         partial: false,
         supplied: 0.0,
         growing: false,
+        one_sided: false,
         holding: true,
         silent: 0.0,
         interval: 0.0,

@@ -1,0 +1,258 @@
+//! A tool's ball that touches in the loop, with a virtual device in virtual time.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod rig;
+
+use std::sync::Arc;
+
+use pliant_haptics::{
+    Cycle, HandModel, LocalModel, LoopConfig, LoopEvent, MAX_PLANES, ModelWriter, SafetyConfig, ToolMap,
+    TouchBall, TouchPlane, VirtualConfig, VirtualDevice, VirtualHandle, VirtualScheduler,
+};
+use pliant_modal::{Body, BodyConfig, Islands, ModalModel, Plane, Probe, ProbeConfig, Together};
+use rig::baked::{made_of, pip, top};
+
+/// A body of 15 cm or a rigid floor, a probe, and a loop whose workspace is 3 cm above the top.
+struct World {
+    body: Option<Body>,
+    probe: Probe,
+    islands: Islands,
+    writer: ModelWriter,
+    cycle: Cycle<VirtualDevice>,
+    hand: VirtualHandle,
+    scheduler: VirtualScheduler,
+    model: LocalModel,
+    events: Vec<LoopEvent>,
+    step: f64,
+    next: f64,
+    /// Largest change of the force in a period and largest work of the motors so far, N and J.
+    jump: f64,
+    given: f64,
+    last: [f64; 3],
+}
+
+const GAP: f64 = 0.03;
+const RADIUS: f64 = 0.01;
+
+impl World {
+    fn new(young: Option<f64>, simulation: f64, device: VirtualConfig, hand: HandModel) -> Self {
+        let device = VirtualDevice::new(device, hand).unwrap();
+        let hand = device.handle();
+        let model = young.map(|young| Arc::new(made_of(&pip(), young, 0.15)));
+        let at = model
+            .as_ref()
+            .map_or([0.0; 3], |model| model.surface().positions()[top(model) as usize].map(f64::from));
+        let origin = [at[0], at[1] + RADIUS + GAP, at[2]];
+        let tool = ToolMap { origin, ..ToolMap::default() };
+        let cycle = Cycle::new(device, LoopConfig { tool, ..LoopConfig::default() }).unwrap();
+        let spring = cycle.core().coupling().grab_config(1.0, 1.0);
+        let config = ProbeConfig {
+            radius: RADIUS,
+            stiffness: spring.stiffness.unwrap(),
+            relaxation: spring.relaxation,
+            friction: 0.5,
+        };
+        let mut probe = Probe::new(config, origin).unwrap();
+        if model.is_none() {
+            probe.set_obstacles(vec![Arc::new(Plane::GROUND)]).unwrap();
+        }
+        let step = 1.0 / simulation;
+        let make = |model: Arc<ModalModel>| {
+            let mut body = Body::new(model, BodyConfig { step, ..BodyConfig::default() }).unwrap();
+            body.set_friction(0.5).unwrap();
+            body
+        };
+        Self {
+            body: model.map(make),
+            probe,
+            islands: Islands::default(),
+            writer: ModelWriter::new(),
+            cycle,
+            hand,
+            scheduler: VirtualScheduler::new(1000.0),
+            model: LocalModel::default(),
+            events: Vec::new(),
+            step,
+            next: 0.0,
+            jump: 0.0,
+            given: 0.0,
+            last: [0.0; 3],
+        }
+    }
+
+    fn tick(&mut self) {
+        let now = self.scheduler.now();
+        while now >= self.next - 1e-12 {
+            self.next += self.step;
+            let seen = *self.cycle.core().last();
+            if seen.now > 0.0 {
+                self.probe.set_target(seen.tool).unwrap();
+            }
+            let mut bodies: Vec<_> = self.body.iter_mut().map(|body| Together::new(7, body)).collect();
+            let probes = std::slice::from_mut(&mut self.probe);
+            self.islands.step_with(&mut bodies, probes, self.step, |_, _| false, |_, _| true);
+            assert!(bodies.iter().all(|body| body.error.is_none()));
+            let config = *self.probe.config();
+            let ball = TouchBall {
+                radius: config.radius,
+                stiffness: config.stiffness,
+                relaxation: config.relaxation,
+            };
+            let planes = self.probe.contacts().iter().map(|c| TouchPlane {
+                key: 7,
+                point: c.point,
+                normal: c.normal,
+                velocity: c.velocity,
+                compliance: c.compliance,
+                friction: c.friction,
+            });
+            let stored = self.body.as_ref().map_or(0.0, Body::energy);
+            self.model.interval = self.step;
+            self.writer.write_touch(ball, planes, stored, self.step, seen.now, &mut self.model);
+        }
+        self.cycle.step(&mut self.scheduler, &self.model, &mut self.events);
+        let force = self.force();
+        let change = force.iter().zip(self.last).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        self.jump = self.jump.max(change);
+        self.last = force;
+        self.given = self.given.max(self.cycle.device().work());
+    }
+
+    fn force(&self) -> [f64; 3] {
+        self.cycle.core().last().wrench.force
+    }
+
+    fn tool(&self) -> [f64; 3] {
+        self.cycle.core().last().tool
+    }
+
+    /// Leads the hand to a place in a time, s, and calls `each` after every period.
+    fn lead(&mut self, from: [f64; 3], to: [f64; 3], seconds: f64, mut each: impl FnMut(&Self)) {
+        let ticks = (seconds * 1000.0) as u32;
+        for k in 1..=ticks {
+            let s = f64::from(k) / f64::from(ticks);
+            self.hand.set_target(std::array::from_fn(|i| from[i] + s * (to[i] - from[i])));
+            self.tick();
+            each(self);
+        }
+    }
+}
+
+const UP: [f64; 3] = [0.0; 3];
+const DOWN: [f64; 3] = [0.0, -GAP - 0.006, 0.0];
+
+fn slew(world: &World) -> f64 {
+    SafetyConfig::for_device(world.cycle.core().info(), 1000.0).slew.unwrap() / 1000.0
+}
+
+#[test]
+fn on_a_rigid_floor_the_hand_feels_the_coupling_spring() {
+    for simulation in [30.0, 60.0, 240.0] {
+        let mut world = World::new(None, simulation, VirtualConfig::touch(), HandModel::FIRM);
+        world.lead(UP, UP, 0.5, |world| assert_eq!(world.force(), [0.0; 3]));
+        world.lead(UP, DOWN, 0.5, |_| {});
+        world.lead(DOWN, DOWN, 2.0, |_| {});
+        let spring = world.probe.config().stiffness;
+        let (force, tool) = (world.force()[1], world.tool()[1]);
+        let want = spring * (RADIUS - tool);
+        println!("{simulation} Hz: {force:.4} N, the spring has {want:.4} N");
+        assert!(want > 0.5 && (force / want - 1.0).abs() < 0.01, "{force} {want}");
+    }
+}
+
+#[test]
+fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
+    for young in [2e4, 1e5, 1e6] {
+        for simulation in [30.0, 60.0, 120.0, 240.0] {
+            for hand in [HandModel::LIGHT, HandModel::FIRM] {
+                let mut world = World::new(Some(young), simulation, VirtualConfig::touch(), hand);
+                let name = format!("E {young:.0e}, {simulation} Hz, {hand:?}");
+                world.lead(UP, UP, 0.5, |world| assert_eq!(world.force(), [0.0; 3], "{name}"));
+                let mut pulled = 0.0f64;
+                let mut most = 0.0f64;
+                world.lead(UP, DOWN, 0.5, |_| {});
+                let side = [0.01, DOWN[1], 0.005];
+                for _ in 0..3 {
+                    world.lead(DOWN, side, 0.4, |world| most = most.max(world.force()[1]));
+                    world.lead(side, DOWN, 0.4, |_| {});
+                }
+                world.lead(DOWN, UP, 0.5, |world| {
+                    for plane in world.model.planes() {
+                        let along: f64 = world.force().iter().zip(plane.normal).map(|(f, n)| f * n).sum();
+                        pulled = pulled.min(along);
+                    }
+                });
+                world.lead(UP, UP, 0.2, |_| {});
+                println!(
+                    "{name}: {most:.2} N, given {:.1e} J, pull {pulled:.1e} N, jump {:.3} of {:.3} N",
+                    world.given,
+                    world.jump,
+                    slew(&world)
+                );
+                assert_eq!(world.force(), [0.0; 3], "{name}: free air is free");
+                assert!(most > 0.05, "{name}: {most}");
+                assert!(world.given <= 5e-3, "{name}: {}", world.given);
+                assert!(pulled >= -1e-3, "{name}: {pulled}");
+                assert!(world.jump <= slew(&world) * 1.000_001, "{name}: {}", world.jump);
+                // Over the closed way the hand has paid.
+                assert!(world.cycle.device().work() <= 1e-6, "{name}: {}", world.cycle.device().work());
+            }
+        }
+    }
+}
+
+#[test]
+fn a_hand_that_rests_on_a_body_is_calm() {
+    for young in [2e4, 1e5, 1e6] {
+        for simulation in [30.0, 60.0, 120.0, 240.0] {
+            for hand in [HandModel::LIGHT, HandModel::FIRM] {
+                let mut world = World::new(Some(young), simulation, VirtualConfig::touch(), hand);
+                world.lead(UP, DOWN, 0.5, |_| {});
+                world.lead(DOWN, DOWN, 3.0, |_| {});
+                let mut fastest = 0.0f64;
+                world.lead(DOWN, DOWN, 1.0, |world| {
+                    let v = world.cycle.device().velocity();
+                    fastest = fastest.max(v.iter().map(|v| v * v).sum::<f64>().sqrt());
+                });
+                println!(
+                    "E {young:.0e}, {simulation} Hz, {hand:?}: {:.2} mm/s, {:?} N",
+                    1e3 * fastest,
+                    world.force()
+                );
+                assert!(fastest < 5e-3, "{young} {simulation} {hand:?}: {fastest}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_touch_at_half_a_meter_a_second_is_no_kick() {
+    for young in [None, Some(2e4), Some(1e6)] {
+        let mut world = World::new(young, 60.0, VirtualConfig::touch(), HandModel::FIRM);
+        world.lead(UP, UP, 0.5, |_| {});
+        world.lead(UP, DOWN, 0.036 / 0.5, |_| {});
+        world.lead(DOWN, DOWN, 0.3, |_| {});
+        println!("{young:?}: largest change {:.3} N of {:.3} N", world.jump, slew(&world));
+        assert!(world.jump > 0.0 && world.jump <= slew(&world) * 1.000_001);
+    }
+}
+
+#[test]
+fn bad_planes_give_no_force_and_a_fault() {
+    let mut world = World::new(None, 60.0, VirtualConfig::touch(), HandModel::FIRM);
+    world.lead(UP, DOWN, 0.5, |_| {});
+    assert!(world.force()[1] > 0.1);
+    for bad in [f64::NAN, f64::INFINITY] {
+        let mut model = world.model.clone();
+        model.tick += 1;
+        model.plane_count = MAX_PLANES + 3;
+        model.planes[0].normal = [0.0, bad, 0.0];
+        assert!(!model.is_finite());
+    }
+    world.model.planes[0].velocity = [f64::NAN; 3];
+    world.model.tick += 1;
+    world.next = f64::INFINITY;
+    world.lead(DOWN, DOWN, 0.2, |world| assert!(world.force().iter().all(|f| f.is_finite())));
+    assert_eq!(world.force(), [0.0; 3]);
+    assert!(world.cycle.core().last().fault.is_some());
+}
