@@ -11,7 +11,8 @@ use crate::fem::{ANCHORED, FeMesh};
 pub(crate) type Blocks = [f64; MAX_NODES * MAX_NODES * 9];
 
 /// Elements with a material. Weights of quadrature points contain the factor of the element's
-/// moduli, in which all energies are linear. Displacements and forces have one entry per free degree of freedom.
+/// moduli, in which all energies are linear. Displacements and forces have one entry per free
+/// degree of freedom.
 #[derive(Clone, Copy)]
 pub(crate) struct Continuum<'a> {
     pub(crate) fe: &'a FeMesh,

@@ -114,8 +114,8 @@ fn a_hand_feels_a_stiff_core_in_a_soft_hull() {
     let positions = model.surface().positions();
     let off = |p: &[f32; 3]| (p[0] - 0.6).powi(2) + (p[1] - 0.2).powi(2) + (p[2] - 0.1).powi(2);
     let end = (0..positions.len()).min_by(|&a, &b| off(&positions[a]).total_cmp(&off(&positions[b])));
-    // One of the radii for which the flexibility is baked. Between two of them a body of one material
-    // is off by 1.8 % on this coarse mesh.
+    // One of the radii for which the flexibility is baked. Between two of them a body of one
+    // material is off by 1.8 % on this coarse mesh.
     let patch = Patch::around(model.surface(), end.unwrap() as u32, 0.113 * 0.6).unwrap();
     for (elasticity, way, most) in [
         (Elasticity::Linear, [5e-5, 1e-4, 5e-5], 0.005),

@@ -34,8 +34,8 @@ const BACK: f64 = 0.01;
 const BACK_FOR: Duration = Duration::from_millis(100);
 const BACK_WITHIN: Duration = Duration::from_millis(525);
 
-/// For so long after a tick that was guessed, an error is what the network's losses cost: two frames
-/// that are lost in a row cost 1 %. Largest share of such ticks.
+/// For so long after a tick that was guessed, an error is what the network's losses cost: two
+/// frames that are lost in a row cost 1 %. Largest share of such ticks.
 const LOST_FOR: Duration = Duration::from_millis(200);
 const MAX_LOST: f64 = 0.1;
 

@@ -173,8 +173,8 @@ fn adaptive_playout_waits_only_for_what_scatters() {
         let counts = view.counts();
         let guessed = (counts.guessed - before.guessed) as f64 / (counts.stepped - before.stepped) as f64;
         println!("jitter {jitter:?}: {guessed:.3} guessed");
-        // Where the round trip scatters by more than 50 ms, the host takes it for a queue, by chance,
-        // and sends no repeats: with 30 ms, 4 of 12 seeds guess 10 to 15 % for that alone.
+        // Where the round trip scatters by more than 50 ms, the host takes it for a queue, by
+        // chance, and sends no repeats: with 30 ms, 4 of 12 seeds guess 10 to 15 % for that alone.
         assert!(guessed < 0.05 || jitter > 20 * MS, "jitter {jitter:?}: {guessed} guessed");
         assert!(counts.repaired + counts.too_late <= counts.guessed, "{counts:?}");
         view.visual_delay() / 0.025

@@ -324,8 +324,8 @@ impl Equations {
         self.target.len()
     }
 
-    /// Adds the sketch of a column: sums of its coordinates' rows with signs at random (M. Charikar,
-    /// K. Chen and M. Farach-Colton, *Finding Frequent Items in Data Streams*, 2002).
+    /// Adds the sketch of a column: sums of its coordinates' rows with signs at random (M.
+    /// Charikar, K. Chen and M. Farach-Colton, *Finding Frequent Items in Data Streams*, 2002).
     fn sketch(&self, column: &[f64], out: &mut Vec<f32>) {
         let m = self.roots.len();
         for block in column.chunks_exact(m * LANES) {

@@ -19,7 +19,8 @@
 //! elasticity of `p` points: material u8 (0 neo-Hookean, 1 St. Venant-Kirchhoff), `p` u32, weights
 //! f64 x p, gradients f32 x 9 p m. A model without it has linear elasticity only. Section `STIF`,
 //! f32 x t, follows `MESH` where the moduli differ: their factor in each tetrahedron. All numbers
-//! are little-endian. A reader checks magic, version, length and hash before it decodes the payload.
+//! are little-endian. A reader checks magic, version, length and hash before it decodes the
+//! payload.
 
 use std::{
     fs, io,

@@ -256,8 +256,8 @@ fn strangers_that_send_all_they_can_hold_up_no_frame_and_bar_nobody() {
 #[ignore = "measures times"]
 fn times_of_the_frames_of_a_host_that_is_flooded() {
     let _alone = alone();
-    // First without a flood, and with one of another host, for what the machine and the body cost by
-    // themselves.
+    // First without a flood, and with one of another host, for what the machine and the body cost
+    // by themselves.
     for whom in [Whom::Nobody, Whom::Another, Whom::ThisHost] {
         let flooded = flooded(&bar_of(CELLS), Duration::from_secs(10), whom);
         let print = |what: &str, mut frames: Vec<Duration>| {

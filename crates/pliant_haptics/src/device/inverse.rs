@@ -127,7 +127,8 @@ pub struct Inverse {
     late: bool,
 }
 
-/// Ends the connection from another thread, with a command without a force as the last thing it sends.
+/// Ends the connection from another thread, with a command without a force as the last thing it
+/// sends.
 #[derive(Debug, Default)]
 struct ConnectionSwitch {
     /// The connection's other end and the frame of that command.

@@ -45,8 +45,9 @@ const MAX_FORCE: f64 = 1000.0;
 const AGREES: f64 = 0.02;
 /// Looks of the last second at which somebody's state has to be comparable with another's.
 const COMPARED: u32 = 100;
-/// Largest memory of a session at any time, and at its end, bytes. What is in flight counts too, and
-/// the ends of former connections, which the laboratory keeps: a thousand seeds had 10 MB at most.
+/// Largest memory of a session at any time, and at its end, bytes. What is in flight counts too,
+/// and the ends of former connections, which the laboratory keeps: a thousand seeds had 10 MB at
+/// most.
 const MAX_MEMORY: [i64; 2] = [24 << 20, 16 << 20];
 
 /// What to simulate.

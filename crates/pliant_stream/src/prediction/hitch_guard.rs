@@ -25,8 +25,8 @@ const AFTER: Duration = Duration::from_secs(1);
 const PROLONGED: Duration = Duration::from_millis(250);
 /// How far a reaction may exceed the largest that the body gave.
 const BEYOND: f64 = 1.2;
-/// Change of a predicted reaction by news from the host that counts as a surprise, as a share of the
-/// largest reaction that the body gave.
+/// Change of a predicted reaction by news from the host that counts as a surprise, as a share of
+/// the largest reaction that the body gave.
 const SURPRISE: f64 = 0.05;
 /// Time constant with which a reaction fades where no frame comes, s.
 const FADE: f64 = 0.1;
