@@ -275,7 +275,7 @@ pub(crate) fn hold_bodies(
             if grab.is_none() {
                 feel_nothing(held.entity, &mut forces);
             }
-            let stays = grab.is_some_and(|(_, grab)| grab.hold().is(&held.hold));
+            let stays = grab.as_ref().is_some_and(|(_, grab)| grab.hold().is(&held.hold));
             if let (false, Some(id)) = (stays, held.id) {
                 body.release(id);
                 match grab {
