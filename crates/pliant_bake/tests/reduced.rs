@@ -2,11 +2,14 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
 
+mod uniaxial;
+
 use std::sync::Arc;
 
 use pliant_bake::{Bake, BakeConfig, DeadLoad, Material, PrescribedPatch, StaticLoads, bake, deflect};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{Body, BodyConfig, Elasticity, GrabConfig, GrabId, ModalModel, Patch, StepSettings};
+use uniaxial::uniaxial;
 
 fn config(coordinates: usize) -> BakeConfig {
     BakeConfig {
@@ -143,6 +146,94 @@ fn a_slender_cantilever_bends_as_the_elastica() {
         };
         println!("P L^2 / E I = {p}: {:.5}, {:.5}; the elastica {u}, {v}", -mean(0), mean(1));
         assert!((mean(1) - v).abs() < 0.01 && (-mean(0) - u).abs() < 0.01, "{p}: {} {}", mean(0), mean(1));
+    }
+}
+
+/// A bar of 1 m, thirty times as long as thick, with the vertices of its free end.
+fn rod(config: &BakeConfig) -> (Arc<ModalModel>, Vec<u32>) {
+    let mesh = shapes::bar([30, 1, 1], [1.0, 1.0 / 30.0, 1.0 / 30.0]).unwrap();
+    let model = model(&mesh, config);
+    let positions = model.surface().positions();
+    let end = (0..positions.len() as u32).filter(|&v| positions[v as usize][0] > 0.999).collect();
+    (model, end)
+}
+
+/// Steps a body under forces on vertices that depend on its surface, until it is at rest. Returns
+/// the surface.
+fn loaded(
+    model: &Arc<ModalModel>,
+    forces: impl Fn(f64, &[[f32; 3]]) -> Vec<(u32, [f64; 3])>,
+) -> Vec<[f32; 3]> {
+    let mut body = reduced(model, 1.0 / 60.0, StepSettings { damping_scale: 30.0, ..Default::default() });
+    let mut surface = model.surface().positions().to_vec();
+    for step in 0..8_000 {
+        for (vertex, force) in forces((f64::from(step) / 3_000.0).min(1.0), &surface) {
+            body.push(vertex, force).unwrap();
+        }
+        body.step().unwrap();
+        body.reconstruct(&mut surface).unwrap();
+    }
+    surface
+}
+
+fn mean(surface: &[[f32; 3]], vertices: &[u32]) -> [f64; 3] {
+    let sum = |axis: usize| vertices.iter().map(|&v| f64::from(surface[v as usize][axis])).sum::<f64>();
+    std::array::from_fn(|axis| sum(axis) / vertices.len() as f64)
+}
+
+#[test]
+fn a_couple_bends_a_rod_to_a_quarter_of_a_circle() {
+    let config = BakeConfig { young: 1e6, poisson: 0.0, ..config(30) };
+    let (model, end) = rod(&config);
+    let side = 1.0 / 30.0;
+    let angle = std::f64::consts::FRAC_PI_2;
+    let couple = angle * 1e6 * f64::powi(side, 4) / 12.0;
+    let rest = model.surface().positions();
+    let half = |above: bool| -> Vec<u32> {
+        end.iter().copied().filter(|&v| (f64::from(rest[v as usize][1]) > 0.5 * side) == above).collect()
+    };
+    let [low, high] = [half(false), half(true)];
+    assert!(low.len() == 2 && high.len() == 2);
+    let surface = loaded(&model, |part, surface| {
+        // The pair of forces turns with the end face: it stays across the way from low to high.
+        let across = minus(mean(surface, &high), mean(surface, &low));
+        let force = part * couple / (2.0 * norm(across));
+        let along = [across[1], -across[0], 0.0].map(|x| x * force / norm(across));
+        let pull = |v: &u32| (*v, along);
+        let press = |v: &u32| (*v, along.map(|x| -x));
+        low.iter().map(pull).chain(high.iter().map(press)).collect()
+    });
+    let tip = mean(&surface, &end);
+    // The axis is an arc: x = R sin(L / R), y = R (1 - cos(L / R)), R = 2 L / pi.
+    let radius = 1.0 / angle;
+    let off = norm([tip[0] - radius, tip[1] - 0.5 * side - radius, tip[2] - 0.5 * side]);
+    println!("the tip of a rod bent by 90 degrees is at {tip:.4?}, off by {off:.4} of its length");
+    // The coordinates do not have all of so large a turn (docs/limits.md).
+    assert!(off < 0.05, "{tip:?}");
+}
+
+#[test]
+fn a_stretched_rod_pulls_as_its_law_says() {
+    let side = 1.0 / 30.0;
+    let stretch = 1.3;
+    for material in [Material::NeoHookean, Material::StVenantKirchhoff] {
+        let config = BakeConfig { young: 1e6, material: Some(material), ..config(30) };
+        let (model, end) = rod(&config);
+        let stress = match material {
+            Material::NeoHookean => uniaxial(config.young, config.poisson, stretch),
+            _ => 0.5 * config.young * stretch * (stretch * stretch - 1.0),
+        };
+        let force = stress * side * side / end.len() as f64;
+        let surface = loaded(&model, |part, _| end.iter().map(|&v| (v, [part * force, 0.0, 0.0])).collect());
+        // The middle does not feel how the ends are held.
+        let at = |x: f32| {
+            let positions = model.surface().positions();
+            let near = |v: &u32| (positions[*v as usize][0] - x).abs() < 1e-3;
+            mean(&surface, &(0..positions.len() as u32).filter(near).collect::<Vec<_>>())[0]
+        };
+        let got = (at(0.8) - at(0.2)) / 0.6;
+        println!("{material}: stretched to {got:.5}, the closed form {stretch}");
+        assert!((got - stretch).abs() < 0.005, "{material}: {got}");
     }
 }
 
