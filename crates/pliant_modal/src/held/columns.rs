@@ -28,7 +28,10 @@ const CORRECTION: f64 = 1e-8;
 const ENERGY: f64 = 0.02;
 
 /// Ways of a hand in training shapes, as shares of the body's size.
-const WAYS: [f64; 4] = [0.04, 0.1, 0.2, 0.4];
+const WAYS: [f64; 5] = [0.04, 0.08, 0.16, 0.3, 0.5];
+
+/// Ways of shapes that are not corrected begin here.
+const FAR: f64 = 0.4;
 
 /// Number of points, outside and inside the region, that find the shapes that are corrected.
 const POINTS: [usize; 2] = [200, 400];
@@ -119,6 +122,8 @@ impl Columns {
         for (index, load) in loads.iter().enumerate() {
             let own: Vec<&GuidedShape> =
                 guided.iter().filter(|(patch, _)| *patch == index).map(|(_, shape)| shape).collect();
+            let near = |shape: &&GuidedShape| shape.there.norm() < FAR * model.size();
+            let own: Vec<&GuidedShape> = own.into_iter().filter(near).collect();
             let cases = own.len();
             if cases == 0 {
                 continue;

@@ -71,7 +71,7 @@ pub(crate) fn key(patch: &Patch) -> PatchKey {
 
 /// The own shapes of the patches that hands hold on a body with reduced elasticity.
 ///
-/// They are made once, which takes a fraction of a second, and shared by all copies of the body.
+/// They are made once, which takes about half a second, and shared by all copies of the body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeldShapes {
     model: ModelHash,
