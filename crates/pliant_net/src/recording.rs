@@ -8,9 +8,9 @@
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TrySendError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -111,7 +111,8 @@ pub(crate) struct SessionRecorder {
     to: Option<SyncSender<(Duration, KeptRecord)>>,
     waiting: Arc<AtomicUsize>,
     thread: Option<JoinHandle<()>>,
-    ended: Receiver<()>,
+    /// In a mutex, because resources are shared between threads.
+    ended: Mutex<Receiver<()>>,
     patience: Duration,
     path: PathBuf,
 }
@@ -151,7 +152,14 @@ impl SessionRecorder {
         };
         let thread = std::thread::Builder::new().name("pliant-record".into()).spawn(write).map_err(fail)?;
         let path = path.to_owned();
-        Ok(Self { to: Some(to), waiting, thread: Some(thread), ended, patience: PATIENCE, path })
+        Ok(Self {
+            to: Some(to),
+            waiting,
+            thread: Some(thread),
+            ended: Mutex::new(ended),
+            patience: PATIENCE,
+            path,
+        })
     }
 
     pub(crate) fn put(&mut self, at: Duration, record: &SessionRecord) {
@@ -208,7 +216,8 @@ impl Drop for SessionRecorder {
     fn drop(&mut self) {
         self.to = None;
         let Some(thread) = self.thread.take() else { return };
-        if self.ended.recv_timeout(self.patience) == Err(RecvTimeoutError::Timeout) {
+        let ended = self.ended.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if ended.recv_timeout(self.patience) == Err(RecvTimeoutError::Timeout) {
             let patience = self.patience.as_secs();
             warn!("{}: the disk took more than {patience} s; the recording is given up", self.path.display());
             return;
