@@ -170,7 +170,7 @@ pub(crate) fn place_obstacles(
     }
     for (entity, probe, mut state) in &mut probes {
         if let Err(error) = give_probe(&all, probe, &mut state) {
-            refusals.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+            commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
         }
     }
     for (entity, mut state, mut nearby, driven, layers, friction) in &mut bodies {
