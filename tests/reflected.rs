@@ -23,7 +23,7 @@ use pliant::{
 const CRATES: [&str; 4] = ["pliant_body", "pliant_contact", "pliant_net", "pliant_haptics"];
 
 /// The public components and resources that are not registered, and why.
-const WITHOUT: [(&str, &str); 11] = [
+const WITHOUT: [(&str, &str); 12] = [
     ("BakeRequest", "may hold code of the game, which cannot be saved"),
     ("Bakery", "bakes that are running"),
     ("BodyState", "a solver that runs; a saved world has SavedState in its place"),
@@ -34,6 +34,7 @@ const WITHOUT: [(&str, &str); 11] = [
     ("NetGuest", "open connections"),
     ("NetHost", "open connections"),
     ("NetPeer", "open connections"),
+    ("ProbeState", "a solver that runs; it is made again from its TouchProbe"),
     ("PointerSource", "a handle of a running device"),
 ];
 
@@ -146,6 +147,7 @@ fn a_scene_in_bevys_notation_names_a_model_by_its_path() {
 
 /// Bevy's prelude and ours, as a game imports them.
 mod both {
+    #[expect(unused_imports, reason = "that no name is taken from it is the test")]
     pub use bevy::prelude::*;
     pub use pliant::prelude::*;
 }
@@ -168,10 +170,10 @@ import! {
     HapticFault, HapticNotice, HapticTool, HapticsPlugin, Impulse, Inertia,
     Integrator, ModalAsset, ModalBody, ModalModel, NoPointerGrab, Obstacle,
     Patch, PliantBodyPlugin, PliantDisplaySystems, PliantGizmos, PliantPlugins, PliantSystems,
-    PliantTick, PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld, Push,
+    PliantTick, PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld, ProbeState, Push,
     Relaxation, Released, RideOn, RidingPlugin, SingleSteps, StepSettings,
     SurfaceAnchor, SurfaceDeformation, SurfaceDetail, SurfacePlace, SurfaceShading, Teleport,
-    ToolGrabs, ToolGrip, ToolOffset, ToolPose, TouchBodies, VisualState,
+    ToolGrabs, ToolGrip, ToolOffset, ToolPose, ToolTouch, TouchBodies, TouchProbe, VisualState,
 }
 
 #[test]
