@@ -63,13 +63,18 @@ fn lead(body: &mut Body, hands: &[(GrabId, Vector)]) {
 }
 
 /// Errors of the forces, as a share of the largest, and of the surface, m, without and with shapes.
-fn errors(mesh: &TetMesh, model: &Arc<ModalModel>, hands: &[(Patch, Vector)]) -> [[f64; 2]; 2] {
+fn errors(
+    mesh: &TetMesh,
+    config: &BakeConfig,
+    model: &Arc<ModalModel>,
+    hands: &[(Patch, Vector)],
+) -> [[f64; 2]; 2] {
     let held: Vec<PrescribedPatch> = hands
         .iter()
         .map(|(patch, way)| PrescribedPatch { patch: patch.clone(), displacement: *way })
         .collect();
     let loads = StaticLoads { prescribed: &held, ..Default::default() };
-    let full = deflect(mesh, &config(), Material::NeoHookean, &loads).unwrap();
+    let full = deflect(mesh, config, Material::NeoHookean, &loads).unwrap();
     let patches: Vec<Patch> = hands.iter().map(|(patch, _)| patch.clone()).collect();
     let shapes = HeldShapes::new(model, &patches).unwrap().map(Arc::new);
     assert!(shapes.is_some());
@@ -110,7 +115,7 @@ fn shapes_of_the_patch_give_the_force_and_the_dent() {
         ("end, sideways by .5", [1.0, 0.05, 0.05], 0.08, [0.0, 0.5, 0.0], [0.03, 0.01]),
     ];
     for (name, at, radius, way, bounds) in rows {
-        let [without, with] = errors(&mesh, &model, &[(around(at, radius), way)]);
+        let [without, with] = errors(&mesh, &config(), &model, &[(around(at, radius), way)]);
         println!("{name}: force and surface off by {with:.4?}, without the shapes by {without:.4?}");
         assert!(with[0] < bounds[0] && with[1] < bounds[1], "{name}: {with:?}");
     }
@@ -118,9 +123,23 @@ fn shapes_of_the_patch_give_the_force_and_the_dent() {
         (around([0.9, 0.1, 0.05], 0.05), [0.0, 0.02, 0.0]),
         (around([0.7, 0.1, 0.05], 0.05), [0.0, -0.02, 0.0]),
     ];
-    let [without, with] = errors(&mesh, &model, &two);
+    let [without, with] = errors(&mesh, &config(), &model, &two);
     println!("two hands that shear: {with:.4?}, without the shapes {without:.4?}");
     assert!(with[0] < 0.03 && with[1] < 2e-3, "{with:?}");
+}
+
+#[test]
+fn a_bar_that_is_clamped_at_both_ends_pulls_back_as_the_full_solution() {
+    let anchors = ["x<1e-9", "x>0.999"].map(|anchor| anchor.parse().unwrap());
+    let config = BakeConfig { anchors: anchors.into(), ..config() };
+    let mesh = slender();
+    let model = model(&mesh, &config);
+    let middle = Patch::around(model.surface(), vertex(&model, [0.5, 0.1, 0.05]), 0.08).unwrap();
+    for (by, bounds) in [(0.06, [0.02, 2e-3]), (0.15, [0.03, 3e-3])] {
+        let [without, with] = errors(&mesh, &config, &model, &[(middle.clone(), [0.0, by, 0.0])]);
+        println!("middle by {by}: force and surface off by {with:.4?}, without {without:.4?}");
+        assert!(with[0] < bounds[0] && with[1] < bounds[1], "{by}: {with:?}");
+    }
 }
 
 #[test]
