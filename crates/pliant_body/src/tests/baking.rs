@@ -223,7 +223,7 @@ fn a_painted_mesh_becomes_a_body() {
     app.update();
     let [painted, numbers] = [waiting, by_numbers].map(|entity| {
         let handle = app.world().get::<ModalBody>(entity).unwrap().model.clone();
-        app.world().resource::<Assets<ModalAsset>>().get(&handle).unwrap().model().clone()
+        app.world().resource::<Assets<ModalAsset>>().get(&handle).unwrap().0.clone()
     });
     assert!(!painted.is_free());
     // The body's surface is that of the mesh, with its seams.
