@@ -27,26 +27,19 @@ pub const ATTRIBUTE_DENSITY: MeshVertexAttribute =
 pub const ATTRIBUTE_ANCHOR: MeshVertexAttribute =
     MeshVertexAttribute::new("Anchor", 0x5049_4e54_0003, VertexFormat::Float32);
 
-/// What a request needs before its bake can begin.
-pub(super) enum Ready {
-    /// Nothing.
-    Now(BakeRequest),
-    /// A mesh that is not loaded yet.
-    Later,
-}
-
-/// Replaces the handle of a mesh by its surface, and adds what is painted on it.
+/// Replaces the handle of a mesh by its surface, and adds what is painted on it. Returns `None`
+/// while the mesh is being loaded.
 pub(super) fn resolve(
     request: &BakeRequest,
     meshes: Option<&Assets<Mesh>>,
     server: Option<&AssetServer>,
-) -> Result<Ready, BakeBodyError> {
-    let BakeShape::Mesh(handle) = &request.shape else { return Ok(Ready::Now(request.clone())) };
+) -> Result<Option<BakeRequest>, BakeBodyError> {
+    let BakeShape::Mesh(handle) = &request.shape else { return Ok(Some(request.clone())) };
     let Some(mesh) = meshes.and_then(|meshes| meshes.get(handle)) else {
         let state = server.and_then(|server| server.get_load_state(handle));
         return match state {
             Some(LoadState::Failed(error)) => Err(BakeBodyError::Load(error.to_string())),
-            _ => Ok(Ready::Later),
+            _ => Ok(None),
         };
     };
     let refused = |expected| BakeBodyError::UnusableMesh { expected };
@@ -67,5 +60,5 @@ pub(super) fn resolve(
     if config.paint.is_none() && [&stiffness, &density, &anchored].iter().any(|values| !values.is_empty()) {
         config.paint = Some(Paint { surface: surface.clone(), stiffness, density, anchored });
     }
-    Ok(Ready::Now(BakeRequest { shape: surface.into(), config, ..request.clone() }))
+    Ok(Some(BakeRequest { shape: surface.into(), config, ..request.clone() }))
 }

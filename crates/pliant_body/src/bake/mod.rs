@@ -13,7 +13,7 @@ pub use from_mesh::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS};
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 
 use crate::{ModalAsset, ModalBody};
-use from_mesh::{Ready, resolve};
+use from_mesh::resolve;
 use job::{BakeJob, Outcome};
 
 /// Bakes the bodies of [`BakeRequest`]s on separate threads while the game runs.
@@ -150,12 +150,12 @@ fn work(
     {
         let Ok((name, request, mut progress, _)) = requests.get_mut(entity) else { continue };
         match resolve(request, meshes.as_deref(), server.as_deref()) {
-            Ok(Ready::Now(request)) => {
+            Ok(Some(request)) => {
                 let job = BakeJob::start(entity, request, bakery.cache.clone());
                 *progress = job.progress();
                 bakery.running = Some(job);
             }
-            Ok(Ready::Later) => loading.push_back(entity),
+            Ok(None) => loading.push_back(entity),
             Err(error) => {
                 error!("{name}: {error}");
                 *progress = BakeProgress::Failed { reason: error.to_string() };
