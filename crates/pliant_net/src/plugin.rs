@@ -9,8 +9,8 @@ use bevy::prelude::*;
 use pliant_body::{PliantDisplaySystems, PliantSystems};
 use thiserror::Error;
 
-use crate::guest::{self, JoinConfig, NetGuest};
-use crate::host::{self, HostConfig, NetHost};
+use crate::guest::{self, Interest, JoinConfig, NetGuest};
+use crate::host::{self, Holding, HostConfig, NetHost};
 use crate::metrics::{self, NetStats, RateMarks};
 use crate::peer::{self, NetPeer, PeerConfig};
 use crate::recording::{RecordingError, SessionRecording};
@@ -129,9 +129,12 @@ impl Plugin for NetPlugin {
             return;
         };
         metrics::register(app);
+        remote::register_types(app);
         app.init_resource::<NetStats>()
             .init_resource::<RateMarks>()
             .register_type::<SharedBody>()
+            .register_type::<Holding>()
+            .register_type::<Interest>()
             .register_type::<RemoteBody>()
             .register_type::<RemoteHands>()
             .register_type::<User>()

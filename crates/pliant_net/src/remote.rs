@@ -114,14 +114,18 @@ pub struct SessionClosed {
     pub reason: DisconnectReason,
 }
 
-pub(crate) fn register(app: &mut App) {
+/// Registers the types for every role: what one role saves, another may load.
+pub(crate) fn register_types(app: &mut App) {
     app.register_type::<BodyArrived>()
         .register_type::<BodyLeft>()
         .register_type::<GrabRefused>()
         .register_type::<SessionLost>()
         .register_type::<SessionJoined>()
-        .register_type::<SessionClosed>()
-        .add_message::<BodyArrived>()
+        .register_type::<SessionClosed>();
+}
+
+pub(crate) fn register(app: &mut App) {
+    app.add_message::<BodyArrived>()
         .add_message::<BodyLeft>()
         .add_message::<GrabRefused>()
         .add_message::<SessionLost>()

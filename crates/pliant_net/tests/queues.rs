@@ -14,7 +14,7 @@ mod endpoint {
 
     /// What the queues carry, without what they do not look at.
     #[derive(Debug)]
-    #[allow(dead_code, reason = "the queues carry what they do not read")]
+    #[expect(dead_code, reason = "the queues carry what they do not read")]
     pub enum Event {
         Connected { peer: PeerId },
         Datagram { peer: PeerId, at: Instant, bytes: Bytes },

@@ -16,7 +16,8 @@ use crate::remote::RemoteBody;
 ///
 /// Fewer modes need fewer bytes and less work, and give a coarser shape. Modes are ordered: the
 /// first are the largest motions.
-#[derive(Component, Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+#[derive(Component, Reflect, Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+#[reflect(Component, Default, Clone, PartialEq)]
 pub enum Interest {
     /// All modes that this guest accepts. Default.
     #[default]

@@ -13,7 +13,8 @@ use crate::user::HandOf;
 /// Whose hands may be on a body at the same time. As a component on a host's body, it applies to
 /// that body. Otherwise [`HostConfig::holding`](super::HostConfig::holding) applies. A change ends
 /// no existing grab.
-#[derive(Component, Debug, Default, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq, Hash)]
+#[reflect(Component, Default, Clone, PartialEq)]
 pub enum Holding {
     /// Any user's hands: the paper's cooperative mode. Default.
     #[default]
