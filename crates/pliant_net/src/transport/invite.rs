@@ -116,7 +116,9 @@ impl FromStr for Invite {
         if !printable {
             return Err(wrong("a host name or address"));
         }
-        Ok(Self { host: host.to_owned(), port, fingerprint, token })
+        // One spelling of an address, so that invites that mean the same are equal.
+        let host = host.parse::<Ipv6Addr>().map_or_else(|_| host.to_owned(), |address| address.to_string());
+        Ok(Self { host, port, fingerprint, token })
     }
 }
 
