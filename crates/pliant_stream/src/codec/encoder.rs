@@ -275,7 +275,7 @@ impl Encoder {
         self.last
     }
 
-    /// Returns true before the first [`Encoder::restart`], and after [`Encoder::retire`].
+    /// Returns true before the first [`Encoder::restart`], and after it has been retired.
     pub fn is_fresh(&self) -> bool {
         self.started.is_none()
     }
