@@ -43,6 +43,9 @@ pub(crate) struct Entry {
     pub(crate) status: DeviceStatus,
     pub(crate) writer: ModelWriter,
     pub(crate) map: Option<ToolMap>,
+    /// Time of the first tick of the loop that was seen after it was told where its workspace lies,
+    /// s.
+    pub(crate) placed: Option<f64>,
     /// Time of the loop's tick whose tool position the simulation has, s.
     pub(crate) seen: f64,
     /// Inputs of the body copy that the loop steps itself. The default means that there is no copy.
@@ -51,6 +54,16 @@ pub(crate) struct Entry {
     /// Buttons that are down according to the messages so far.
     pressed: u32,
     stop: StopSwitch,
+}
+
+/// Time after which a loop that was told where its workspace lies reports tools that are there, s.
+const PLACED_AFTER: f64 = 0.02;
+
+impl Entry {
+    /// Returns whether the tool point that the loop reports is where the tool's entity is.
+    pub(crate) fn is_placed(&self) -> bool {
+        self.placed.is_some_and(|since| self.seen > since + PLACED_AFTER)
+    }
 }
 
 /// A button of a device went down or came up.
@@ -118,6 +131,7 @@ impl HapticDevices {
             status,
             writer: ModelWriter::new(),
             map: None,
+            placed: None,
             seen: 0.0,
             modal_for: super::local_model::CopyOf::default(),
             elsewhere: super::local_model::Elsewhere::default(),

@@ -189,6 +189,9 @@ pub(crate) fn update_tools(
         entry.status.report = *entry.running.get().report();
         let tick = &entry.status.report.tick;
         entry.seen = tick.now;
+        if entry.map.is_some() && entry.placed.is_none() && tick.now > 0.0 {
+            entry.placed = Some(tick.now);
+        }
         pose.set_if_neq(ToolPose {
             position: tick.tool.into(),
             velocity: tick.tool_velocity.into(),
@@ -209,9 +212,10 @@ pub(crate) fn update_tools(
     }
 }
 
-/// Before a tick: leads the balls of the tools that touch.
+/// Before a tick: leads the balls of the tools that touch. A ball begins where its tool is, and not
+/// where a loop says that does not know its workspace yet: it would be caught there.
 pub(crate) fn lead_balls(
-    devices: Res<HapticDevices>,
+    mut devices: ResMut<HapticDevices>,
     mut tools: Query<(&HapticTool, &ToolPose, &ToolTouch, Option<&ToolGrabs>, &mut TouchProbe)>,
 ) {
     for (tool, pose, touch, held, mut probe) in &mut tools {
@@ -220,13 +224,14 @@ pub(crate) fn lead_balls(
         // Without a limit the coupling is infinite. A probe needs a spring.
         let stiffness = spring.map_or(0.0, |spring| spring.stiffness.unwrap_or(STIFFEST));
         let holds = held.is_some_and(|held| !held.entities().is_empty());
+        let placed = devices.entry(tool.device).is_some_and(|entry| entry.is_placed());
         probe.set_if_neq(TouchProbe {
             radius: touch.radius,
             target: pose.position,
             stiffness,
             relaxation: spring.map_or(0.0, |spring| spring.relaxation),
             friction: touch.friction,
-            enabled: stiffness > 0.0 && !holds,
+            enabled: stiffness > 0.0 && !holds && placed,
         });
     }
 }
