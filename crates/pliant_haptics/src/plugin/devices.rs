@@ -44,7 +44,7 @@ pub(crate) struct Entry {
     pub(crate) writer: ModelWriter,
     pub(crate) map: Option<ToolMap>,
     /// Time of the first tick of the loop that was seen after it was told where its workspace lies,
-    /// s.
+    /// or to where it has jumped, s.
     pub(crate) placed: Option<f64>,
     /// Time of the loop's tick whose tool position the simulation has, s.
     pub(crate) seen: f64,

@@ -157,6 +157,9 @@ impl Default for ToolGrip {
     }
 }
 
+/// Way of a workspace between two frames beyond which its tool is put elsewhere and not carried, m.
+const JUMP: f64 = 0.05;
+
 /// Sends the workspace transforms to the loops.
 pub(crate) fn place(
     mut devices: ResMut<HapticDevices>,
@@ -173,6 +176,10 @@ pub(crate) fn place(
         } else if !entry.running.get().set_tool(map) {
             // The queue of the loop is full, so the next frame retries.
             continue;
+        }
+        let jumps = |old: &ToolMap| DVec3::from(old.origin).distance(map.origin.into()) > JUMP;
+        if entry.map.as_ref().is_none_or(jumps) {
+            entry.placed = None;
         }
         entry.map = Some(map);
     }
@@ -213,7 +220,8 @@ pub(crate) fn update_tools(
 }
 
 /// Before a tick: leads the balls of the tools that touch. A ball begins where its tool is, and not
-/// where a loop says that does not know its workspace yet: it would be caught there.
+/// where a loop says that does not know its workspace yet: it would be caught there. Where a
+/// workspace jumps, its ball begins anew.
 pub(crate) fn lead_balls(
     mut devices: ResMut<HapticDevices>,
     mut tools: Query<(&HapticTool, &ToolPose, &ToolTouch, Option<&ToolGrabs>, &mut TouchProbe)>,
