@@ -7,12 +7,12 @@ use std::time::Duration;
 use bevy::{
     asset::AssetPlugin, math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin,
 };
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, TouchProbe};
 
 use pliant_haptics::{
     DeviceId, Fault, HandModel, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool,
-    HapticsPlugin, HeldBy, LoopConfig, LoopState, ToolGrip, ToolPose, VirtualConfig, VirtualDevice,
-    VirtualHandle,
+    HapticsPlugin, HeldBy, LoopConfig, LoopState, ToolGrip, ToolPose, ToolTouch, VirtualConfig,
+    VirtualDevice, VirtualHandle,
 };
 
 #[path = "rig/block.rs"]
@@ -471,4 +471,33 @@ fn a_driver_that_panics_is_told_and_lets_go() {
         let devices = s.app.world().resource::<HapticDevices>();
         devices.get(s.device).unwrap().report.state == LoopState::Running
     });
+}
+
+/// A ball that begins where a loop says that does not know its workspace yet is caught in what lies
+/// there.
+#[test]
+fn a_ball_begins_where_its_tool_is_and_anew_where_the_workspace_jumps() {
+    let mut app = app();
+    let (device, hand) = add_device(&mut app);
+    let mut s = Scene { app, device, tool: Entity::PLACEHOLDER, hand, frames: 0, uneven: false };
+    until(&mut s, "the loop runs", |s| {
+        s.app.world().resource::<HapticDevices>().get(device).unwrap().report.ticks > 100
+    });
+    let tool = (HapticTool::new(device), ToolTouch::default(), Transform::from_xyz(0.0, 0.3, 0.0));
+    s.tool = s.app.world_mut().spawn(tool).id();
+    let probe = |s: &Scene| *s.app.world().get::<TouchProbe>(s.tool).unwrap();
+    until(&mut s, "the ball is there", |s| {
+        let TouchProbe { enabled, target, .. } = probe(s);
+        assert!(!enabled || (target.y - 0.3).abs() < 0.1, "it begins at {target}");
+        enabled
+    });
+    s.app.world_mut().get_mut::<Transform>(s.tool).unwrap().translation.y = 0.6;
+    let mut gone = false;
+    until(&mut s, "the ball is at the new place", |s| {
+        let TouchProbe { enabled, target, .. } = probe(s);
+        gone |= !enabled;
+        assert!(!gone || !enabled || (target.y - 0.6).abs() < 0.1, "it begins anew at {target}");
+        enabled && (target.y - 0.6).abs() < 0.1
+    });
+    assert!(gone, "the ball was dragged along");
 }
