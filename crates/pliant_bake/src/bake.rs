@@ -1,10 +1,9 @@
 //! The complete bake, from tetrahedra to a model.
 
-use std::time::Instant;
-
 use pliant_mesh::{Surface, TetMesh};
 use pliant_modal::tetrahedron::Affine;
 use pliant_modal::{BakeInfo, ModalModel, ModelParts, ReducedElasticity, SimulationMesh};
+use web_time::Instant;
 
 use crate::blocks::{self, Tall};
 use crate::continuum::Continuum;

@@ -85,18 +85,25 @@ pub(crate) fn put(wide: &mut [f64], stride: usize, at: usize, block: &[f64], col
 /// Returns the eigenvalues (ascending) and the eigenvectors (columns) of a small symmetric matrix.
 ///
 /// Returns `None` when the iteration fails.
+///
+/// The matrix is scaled to entries of about one first: the vectors that faer returns for large
+/// entries are wrong (`eigenvectors_do_not_depend_on_the_scale`).
 pub(crate) fn symmetric_eigen(a: MatRef<'_, f64>) -> Option<(Vec<f64>, Mat<f64>)> {
     use faer::diag::Diag;
     use faer::dyn_stack::{MemBuffer, MemStack};
     use faer::linalg::evd;
     let n = a.nrows();
+    let largest = a.norm_max();
+    // A power of two changes no digit.
+    let scale = if largest.is_normal() { largest.log2().floor().exp2() } else { 1.0 };
+    let a = faer::Scale(1.0 / scale) * a;
     let mut values = Diag::<f64>::zeros(n);
     let mut vectors = Mat::zeros(n, n);
     let scratch =
         evd::self_adjoint_evd_scratch::<f64>(n, evd::ComputeEigenvectors::Yes, Par::Seq, Default::default());
     let mut buffer = MemBuffer::new(scratch);
     evd::self_adjoint_evd(
-        a,
+        a.as_ref(),
         values.as_mut(),
         Some(vectors.as_mut()),
         Par::Seq,
@@ -104,6 +111,31 @@ pub(crate) fn symmetric_eigen(a: MatRef<'_, f64>) -> Option<(Vec<f64>, Mat<f64>)
         Default::default(),
     )
     .ok()?;
-    let values: Vec<f64> = (0..n).map(|i| values[i]).collect();
+    let values: Vec<f64> = (0..n).map(|i| scale * values[i]).collect();
     values.iter().all(|v| v.is_finite()).then_some((values, vectors))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn eigenvectors_do_not_depend_on_the_scale() {
+        let n = 150;
+        let unit = Mat::from_fn(n, n, |i, j| {
+            let apart = i.abs_diff(j) as f64;
+            (1.0 + (i.min(j) as f64 * 0.7).sin()) * (-0.3 * apart).exp()
+        });
+        for scale in [1e-12, 1.0, 1e6, 1e10, 1e15] {
+            let a = faer::Scale(scale) * &unit;
+            let (values, vectors) = symmetric_eigen(a.as_ref()).expect("a symmetric matrix");
+            let image = &a * &vectors;
+            let left = Mat::from_fn(n, n, |i, j| image[(i, j)] - values[j] * vectors[(i, j)]);
+            assert!(
+                left.norm_max() < 1e-13 * a.norm_max(),
+                "{scale:e}: {:e}",
+                left.norm_max() / a.norm_max()
+            );
+        }
+    }
 }

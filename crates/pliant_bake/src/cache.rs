@@ -4,17 +4,18 @@
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, SystemTime};
 
 use pliant_mesh::{Surface, TetMesh, io::write_whole};
 use pliant_modal::{Damping, FORMAT_VERSION, ModalModel};
+use web_time::Instant;
 
 use crate::{Bake, BakeConfig, BakeError, BakeTimes, Paint, Stage, bake};
 
 /// Version of the bake method, which is part of every key.
 ///
 /// Raise the version with every change that alters the result of a bake of the same input.
-pub const METHOD_VERSION: u32 = 7;
+pub const METHOD_VERSION: u32 = 8;
 
 /// First bytes of a file of the cache. The [`BakeKey`] of its bake (32 bytes) and the model, as in
 /// a `.modal` file, follow.

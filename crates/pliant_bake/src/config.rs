@@ -57,7 +57,7 @@ pub struct BakeConfig {
     /// Radii of the patches at each site, as fractions of the body's largest extent.
     ///
     /// The flexibility is interpolated between these radii. Default: 0.02, 0.028, 0.04, 0.056,
-    /// 0.08, 0.113, 0.16.
+    /// 0.08, 0.113, 0.16, 0.226, 0.32.
     pub site_radii: Vec<f64>,
     /// Folder that receives `K.mtx` and `M.mtx` (MatrixMarket). Default: none.
     ///
@@ -80,7 +80,7 @@ impl Default for BakeConfig {
             regions: Vec::new(),
             paint: None,
             sites: None,
-            site_radii: vec![0.02, 0.028, 0.04, 0.056, 0.08, 0.113, 0.16],
+            site_radii: vec![0.02, 0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.226, 0.32],
             export_matrices: None,
         }
     }

@@ -50,6 +50,31 @@ fn the_same_bits_whatever_the_threads() {
     }
 }
 
+#[test]
+fn small_regular_meshes_are_never_refused_as_inaccurate() {
+    for cells in 1..=4 {
+        for across in 1..=3 {
+            for modes in [6, 12, 24] {
+                for (anchors, young) in
+                    [(anchor("x<0.001"), 1e5), (anchor("x<0.001"), 1e9), (vec![], 1e5), (vec![], 1e9)]
+                {
+                    let mesh = shapes::bar([cells, across, across], [0.2, 0.12, 0.12]).unwrap();
+                    let config =
+                        BakeConfig { modes, anchors, young, sites: Some(1), ..BakeConfig::default() };
+                    match run(&mesh, &config) {
+                        Ok(made) => assert!(made.model.info().residual_max <= 1e-7),
+                        // The smallest meshes have fewer coordinates.
+                        Err(error) => assert!(
+                            matches!(error, BakeError::Modes { .. }),
+                            "{cells} x {across} x {across}, {modes} modes, {young:e} Pa: {error}"
+                        ),
+                    }
+                }
+            }
+        }
+    }
+}
+
 /// Thirty-two equal bars have every mode of one bar 32 times, so their lowest twenty modes all
 /// equal its lowest mode.
 #[test]

@@ -46,15 +46,8 @@ fn path(t: f64) -> f64 {
 ///
 /// A sign flip in every step gives 4.
 fn ringing(model: &Arc<ModalModel>, integrator: Integrator, step: f64) -> f64 {
-    let mut body = Body::new(
-        model.clone(),
-        BodyConfig {
-            step,
-            settings: StepSettings { integrator, ..Default::default() },
-            ..Default::default()
-        },
-    )
-    .unwrap();
+    let settings = StepSettings { integrator, ..Default::default() };
+    let mut body = Body::new(model.clone(), BodyConfig { step, settings, ..Default::default() }).unwrap();
     let patch = Patch::around(model.surface(), tip(model), 0.06).unwrap();
     let grab = body.grab(&patch, GrabConfig::default()).unwrap();
     let start = body.grab_position(grab).unwrap();
@@ -79,6 +72,108 @@ fn the_dragged_bar_does_not_ring() {
         println!("{integrator:?}: {got:.4}");
         assert!(got < 0.1, "{integrator:?}: {got}");
     }
+}
+
+/// Equation (4) of the paper as printed, solved here: average acceleration, and the force that has
+/// the patch at its target at the end of each step. Returns the reactions, N.
+fn papers_hand(model: &ModalModel, patch: &Patch, step: f64, ways: &[f64]) -> Vec<Vector3<f64>> {
+    let modes = model.mode_count();
+    let rows: Vec<Vector3<f64>> = (0..modes)
+        .map(|mode| {
+            let row = |axis| -> f64 {
+                let entries = patch.entries().iter();
+                entries.map(|&(v, w)| w * f64::from(model.displacement_row(v, axis, mode))).sum()
+            };
+            Vector3::new(row(0), row(1), row(2))
+        })
+        .collect();
+    let quarter = 0.25 * step * step;
+    let mut state = vec![[0.0f64; 3]; modes];
+    let mut reactions = Vec::new();
+    for way in ways {
+        let mass = |k: usize| 1.0 + 0.5 * step * model.damping()[k] + quarter * model.omega()[k].powi(2);
+        let ahead = |k: usize| {
+            let [q, v, a] = state[k];
+            [q + step * v + quarter * a, v + 0.5 * step * a]
+        };
+        let alone = |k: usize| {
+            let [q, v] = ahead(k);
+            -(model.damping()[k] * v + model.omega()[k].powi(2) * q) / mass(k)
+        };
+        let (mut soft, mut left) = (nalgebra::Matrix3::zeros(), Vector3::new(0.0, *way, 0.0));
+        for (k, row) in rows.iter().enumerate() {
+            soft += row * row.transpose() * (quarter / mass(k));
+            left -= row * (ahead(k)[0] + quarter * alone(k));
+        }
+        let force = soft.try_inverse().unwrap() * left;
+        let next: Vec<[f64; 3]> = (0..modes)
+            .map(|k| {
+                let a = alone(k) + rows[k].dot(&force) / mass(k);
+                let [q, v] = ahead(k);
+                [q + quarter * a, v + 0.5 * step * a, a]
+            })
+            .collect();
+        state = next;
+        reactions.push(-force);
+    }
+    reactions
+}
+
+/// The paper's own hand and integrator, by name. Its force is that of the paper's equation, and
+/// flips its sign in every step after a jump of the hand: a position constraint under average
+/// acceleration has the double eigenvalue -1 in the constrained direction.
+#[test]
+fn the_papers_hand_is_its_equation_4() {
+    let settings = StepSettings { integrator: Integrator::Newmark, warp: false, ..Default::default() };
+    for (young, step) in [(1e5, 1.0 / 40.0), (2e6, 1.0 / 40.0), (2e6, 1e-3), (1e9, 1e-3)] {
+        let model = bar(young);
+        let patch = Patch::around(model.surface(), tip(&model), 0.06).unwrap();
+        let config = BodyConfig { step, settings, ..Default::default() };
+        let mut body = Body::new(model.clone(), config).unwrap();
+        let grab = body.grab(&patch, GrabConfig::RIGID).unwrap();
+        let start = body.grab_position(grab).unwrap();
+        // Small enough that the bound of all hands, a pull from one size of the body away, is far.
+        let ways = vec![1e-4; 80];
+        let want = papers_hand(&model, &patch, step, &ways);
+        let (mut worst, mut largest, mut flips) = (0.0f64, 0.0f64, 0);
+        for (i, (way, want)) in ways.iter().zip(&want).enumerate() {
+            body.set_target(grab, [start[0], start[1] + way, start[2]]).unwrap();
+            body.step().unwrap();
+            let got = Vector3::from(body.reaction(grab).unwrap());
+            (worst, largest) = (worst.max((got - want).norm()), largest.max(want.norm()));
+            flips += usize::from(i > 0 && got.y * want.y > 0.0 && want.y * ((i % 2) as f64 - 0.5) > 0.0);
+        }
+        println!("E {young:.0e}, h {step:.4}: off by {:.1e}, {flips} of 79 steps flip", worst / largest);
+        assert!(worst < 1e-6 * largest, "E {young}, h {step}: {worst} N of {largest} N");
+        assert!(flips >= 75, "E {young}, h {step}: {flips}");
+    }
+}
+
+/// A rigid hand is where it should be after each step, and one with the residual flexibility of its
+/// patch is not.
+#[test]
+fn a_rigid_hand_is_at_its_target() {
+    let model = bar(2e6);
+    let patch = Patch::around(model.surface(), tip(&model), 0.06).unwrap();
+    let left = |hold| {
+        let settings = StepSettings { warp: false, ..Default::default() };
+        let config = BodyConfig { step: 1.0 / 40.0, settings, ..Default::default() };
+        let mut body = Body::new(model.clone(), config).unwrap();
+        let grab = body.grab(&patch, hold).unwrap();
+        let start = body.grab_position(grab).unwrap();
+        let mut worst = 0.0f64;
+        for i in 1..=80 {
+            let target = [start[0], start[1] + 0.2 * path(f64::from(i) / 40.0), start[2]];
+            body.set_target(grab, target).unwrap();
+            body.step().unwrap();
+            let at = body.grab_position(grab).unwrap();
+            worst = (0..3).fold(worst, |m, k| m.max((at[k] - target[k]).abs()));
+        }
+        worst
+    };
+    let (rigid, soft) = (left(GrabConfig::RIGID), left(GrabConfig::default()));
+    println!("{rigid:.1e} m from the target, with the residual flexibility {soft:.1e} m");
+    assert!(rigid < 1e-12 && soft > 1e-6, "{rigid} and {soft}");
 }
 
 /// Steps of these lengths, s.

@@ -92,16 +92,17 @@ fn a_bar_hangs_lower_the_heavier_it_is_and_never_behind_its_wall() {
         assert!(x > 0.0, "{times} g: behind the wall at {x} m");
         assert!(fallen > last, "{times} g: {fallen} m, less than {last} m under less");
         last = fallen;
-        if times <= 0.05 {
-            assert!((fallen / -true_y - 1.0).abs() < 0.05, "{times} g: {fallen} m instead of {} m", -true_y);
-        }
+        // The modes of a bar that bends far are off by up to 9 %.
+        let most = if times <= 0.05 { 0.05 } else { 0.1 };
+        assert!((fallen / -true_y - 1.0).abs() < most, "{times} g: {fallen} m instead of {} m", -true_y);
     }
 }
 
-/// A blow and a push do their work along the way of the bent shape's own point: the energy that a
-/// blow gives a body at rest is half the product of the blow and the velocity that the point gets.
+/// An impulse and a push do their work along the way of the bent shape's own point: the energy that
+/// an impulse gives a body at rest is half the product of the impulse and the velocity that the
+/// point gets.
 #[test]
-fn a_blow_on_a_bent_bar_works_along_the_bent_shape() {
+fn an_impulse_on_a_bent_bar_works_along_the_bent_shape() {
     let model = bar();
     let positions = model.surface().positions();
     let end = (0..positions.len()).max_by(|&a, &b| positions[a][0].total_cmp(&positions[b][0])).unwrap();
@@ -118,27 +119,27 @@ fn a_blow_on_a_bent_bar_works_along_the_bent_shape() {
         patch.displacement(q, true)
     };
     let directions = [[1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0], [0.0, 0.0, 1e-3], [6e-4, -7e-4, 2e-4]];
-    for blow in directions {
+    for impulse in directions {
         let mut hit = body.clone();
-        hit.apply_impulse(end as u32, blow).unwrap();
+        hit.apply_impulse(end as u32, impulse).unwrap();
         let kinetic: f64 = hit.v().iter().map(|v| 0.5 * v * v).sum();
         let t = 1e-6;
         let along =
             |sign: f64| -> Vec<f64> { state.q.iter().zip(hit.v()).map(|(q, v)| q + sign * t * v).collect() };
         let speed = (at(&along(1.0)) - at(&along(-1.0))) / (2.0 * t);
-        let work: f64 = 0.5 * speed.iter().zip(blow).map(|(u, j)| u * j).sum::<f64>();
-        assert!((kinetic / work - 1.0).abs() < 1e-4, "{kinetic} J, and {work} J of work for {blow:?}");
-        // At rest the same blow would give another energy: the bar is really bent.
+        let work: f64 = 0.5 * speed.iter().zip(impulse).map(|(u, j)| u * j).sum::<f64>();
+        assert!((kinetic / work - 1.0).abs() < 1e-4, "{kinetic} J, and {work} J of work for {impulse:?}");
+        // At rest the same impulse would give another energy: the bar is really bent.
         let mut straight = Body::new(model.clone(), BodyConfig::from(StepSettings::default())).unwrap();
-        straight.apply_impulse(end as u32, blow).unwrap();
+        straight.apply_impulse(end as u32, impulse).unwrap();
         let other: f64 = straight.v().iter().map(|v| 0.5 * v * v).sum();
         assert!((other / kinetic - 1.0).abs() > 1e-3 || kinetic < 1e-12, "{other} {kinetic}");
-        // A push in one short step gives the same momentum as the blow.
+        // A push in one short step gives the same momentum as the impulse.
         let mut pushed = body.clone();
         let step = 1e-7;
         pushed.reconfigure(BodyConfig { step, ..BodyConfig::from(StepSettings::default()) }).unwrap();
         let (mut free, rest) = (pushed.clone(), hit.v().to_vec());
-        pushed.push(end as u32, blow.map(|j| j / step)).unwrap();
+        pushed.push(end as u32, impulse.map(|j| j / step)).unwrap();
         pushed.step().unwrap();
         free.step().unwrap();
         let gained = pushed.v().iter().zip(free.v()).map(|(a, b)| a - b);

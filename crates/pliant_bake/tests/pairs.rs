@@ -370,3 +370,59 @@ fn contacts_of_bodies_are_deterministic() {
         assert_eq!(a.contacts().contacts(), b.contacts().contacts());
     }
 }
+
+#[test]
+fn bodies_stepped_on_several_threads_are_the_same_to_the_bit() {
+    let cube = cube(1e5, |_| ());
+    // Two that meet, and ten on their own, two of which pass through each other.
+    let start: Vec<Body> = (0..12)
+        .map(|i| {
+            let at = match i {
+                0 => [0.0; 3],
+                1 => [0.22, 0.04, 0.01],
+                10 | 11 => [10.0, 0.0, 0.0],
+                i => [f64::from(i), 0.0, 0.0],
+            };
+            let speed = if i == 1 { -1.0 } else { 0.0 };
+            place(&cube, 240.0, 9.81, at, LEVEL, [speed, 0.0, 0.0], [1.0, 0.1 * f64::from(i), 0.0])
+        })
+        .collect();
+    let run = |threads: usize| {
+        let (mut bodies, mut islands) = (start.clone(), Islands::default());
+        let mut touched = false;
+        for _ in 0..60 {
+            let mut all: Vec<Together<'_>> =
+                bodies.iter_mut().enumerate().map(|(key, body)| Together::new(key as u64, body)).collect();
+            all[10].touches = false;
+            if threads == 1 {
+                islands.step(&mut all, |_, _| true);
+            } else {
+                islands.step_by(
+                    &mut all,
+                    &mut [],
+                    0.0,
+                    |_, _| true,
+                    |_, _| false,
+                    |all, step| {
+                        std::thread::scope(|scope| {
+                            for part in all.chunks_mut(12usize.div_ceil(threads)) {
+                                scope.spawn(move || part.iter_mut().rev().for_each(step));
+                            }
+                        });
+                    },
+                );
+            }
+            assert!(all.iter().all(|together| together.error.is_none()));
+            touched |= all[0].body.contacts().contacts().iter().any(|c| c.other == Touched::Body(1));
+            assert!(all[11].body.contacts().contacts().is_empty(), "the other touches nothing");
+        }
+        assert!(touched, "the first two met");
+        bodies
+    };
+    let alone = run(1);
+    for threads in [2, 3, 12] {
+        for (a, b) in alone.iter().zip(&run(threads)) {
+            assert_eq!(a.state(), b.state(), "on {threads} threads");
+        }
+    }
+}

@@ -63,6 +63,15 @@ fn a_hand_feels_the_full_stiffness_between_the_sites() {
             "{radius}: {between:?}"
         );
     }
+    // A palm: as wide as the bar and wider, up to nearly a third of its length.
+    for radius in [0.19, 0.25, 0.3] {
+        let palm = errors(&mesh, &config, radius);
+        assert!(
+            at(&palm, 0.5) < 0.005 && at(&palm, 0.9) < 0.02 && at(&palm, 1.0) < 0.06,
+            "{radius}: {:?}",
+            [0.5, 0.9, 1.0].map(|share| at(&palm, share))
+        );
+    }
     // With sites at half the vertices, the result is also interpolated between neighbors.
     let sparse = errors(&mesh, &BakeConfig { sites: Some(128), ..config }, 0.09);
     assert!(at(&sparse, 0.5) < 0.005 && at(&sparse, 0.9) < 0.04 && at(&sparse, 1.0) < 0.25, "{sparse:?}");

@@ -63,7 +63,7 @@ pub enum Precision {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-enum Rows {
+enum BasisRows {
     Single(Vec<[Row<f32>; ROWS]>),
     /// Half precision has a narrow range, so the rows of every mode are divided by their largest
     /// entry.
@@ -76,7 +76,7 @@ pub struct Basis {
     vertices: usize,
     modes: usize,
     /// Layout: `[block][mode][row][lane]`.
-    rows: Rows,
+    rows: BasisRows,
     /// Factors per mode for displacement and rotation, by which stored rows must be multiplied.
     scales: Vec<[f32; 2]>,
     /// Rest positions, `[block][axis][lane]`, m.
@@ -108,7 +108,7 @@ impl Basis {
                 }
             }
         }
-        Self { vertices, modes, rows: Rows::Single(rows), scales: vec![[1.0; 2]; modes], rest }
+        Self { vertices, modes, rows: BasisRows::Single(rows), scales: vec![[1.0; 2]; modes], rest }
     }
 
     /// Returns the same modes in half precision.
@@ -117,7 +117,7 @@ impl Basis {
     /// at most 2^-11 of the largest entry of its mode (displacement and rotation have separate
     /// scales).
     pub fn to_half(&self) -> Self {
-        let Rows::Single(single) = &self.rows else { return self.clone() };
+        let BasisRows::Single(single) = &self.rows else { return self.clone() };
         let mut scales = vec![[0.0f32; 2]; self.modes];
         for (index, rows) in single.iter().enumerate() {
             let scale = &mut scales[index % self.modes];
@@ -136,7 +136,7 @@ impl Basis {
                 })
             })
             .collect();
-        Self { rows: Rows::Half(half), scales, rest: self.rest.clone(), ..*self }
+        Self { rows: BasisRows::Half(half), scales, rest: self.rest.clone(), ..*self }
     }
 
     /// Number of surface vertices.
@@ -152,7 +152,7 @@ impl Basis {
     /// Bytes that one warped reconstruction with `modes` modes reads and writes. They set a lower
     /// bound on its time.
     pub fn traffic_bytes(&self, modes: usize) -> usize {
-        let number = if matches!(self.rows, Rows::Single(_)) { 4 } else { 2 };
+        let number = if matches!(self.rows, BasisRows::Single(_)) { 4 } else { 2 };
         let rows = modes.min(self.modes) * ROWS * number;
         self.rest.len() * (rows + 3 * 4) * BLOCK + self.vertices * 12
     }
@@ -161,8 +161,8 @@ impl Basis {
     /// Returns `None` in half precision.
     pub fn rows(&self) -> Option<&[[[f32; BLOCK]; ROWS]]> {
         match &self.rows {
-            Rows::Single(rows) => Some(rows),
-            Rows::Half(_) => None,
+            BasisRows::Single(rows) => Some(rows),
+            BasisRows::Half(_) => None,
         }
     }
 
@@ -222,8 +222,8 @@ impl Basis {
         // SAFETY: The caller guarantees that the instruction set of `L` is available.
         unsafe {
             match &self.rows {
-                Rows::Single(rows) => self.reconstruct_rows::<L, f32>(rows, warped, bodies),
-                Rows::Half(rows) => self.reconstruct_rows::<L, f16>(rows, warped, bodies),
+                BasisRows::Single(rows) => self.reconstruct_rows::<L, f32>(rows, warped, bodies),
+                BasisRows::Half(rows) => self.reconstruct_rows::<L, f16>(rows, warped, bodies),
             }
         }
     }

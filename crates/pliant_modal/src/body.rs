@@ -8,11 +8,7 @@ use crate::{
     Contacts, Frame, FrameMotion, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel,
     ObstacleShape, Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
-    step::{
-        Six,
-        group::{Parts, View},
-        tangent,
-    },
+    step::group::{Parts, View},
 };
 
 /// Identifier of a grab on a body. A body never uses an identifier twice.
@@ -449,12 +445,12 @@ impl Body {
     pub fn push(&mut self, vertex: u32, force: [f64; 3]) -> Result<(), StepError> {
         finite("force", &force)?;
         let force = Vector3::from(force);
-        let mut pushes = std::mem::take(&mut self.pushes);
-        let pushed = self.press(vertex, &force, &mut pushes);
-        self.pushes = pushes;
-        let arm = pushed?;
+        let pressed = self.kernel.press(&self.state, vertex, &force)?;
+        for (mode, push) in self.pushes.iter_mut().enumerate() {
+            *push += pressed.modal_force(mode);
+        }
         self.push_force += force;
-        self.push_torque += arm.cross(&force);
+        self.push_torque += pressed.arm.cross(&force);
         Ok(())
     }
 
@@ -483,65 +479,7 @@ impl Body {
     /// Returns an error if the impulse is not finite, if it brings a velocity or an acceleration
     /// above 1e100, or if the vertex is not on the surface. The body then stays as it was.
     pub fn apply_impulse(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
-        finite("impulse", &impulse)?;
-        let impulse = Vector3::from(impulse);
-        let mut gained = std::mem::take(&mut self.resisted);
-        gained.fill(0.0);
-        let struck = self.press(vertex, &impulse, &mut gained);
-        self.resisted = gained;
-        let arm = struck?;
-        self.spare.clone_from(&self.state);
-        for i in 0..self.mode_count() {
-            let dv = self.resisted[i];
-            self.state.v[i] += dv;
-            // The acceleration belongs to the state, so it includes the damping force of the new
-            // velocity.
-            self.state.a[i] -= self.kernel.damping()[i] * dv;
-        }
-        if self.model().is_free() {
-            self.state.frame.add_momentum(self.kernel.model(), impulse, arm.cross(&impulse));
-        }
-        // An overflow must be rejected here. A later step that fails would only restore the state
-        // before that step, which is this state.
-        if self.state.is_moderate() {
-            return Ok(());
-        }
-        self.state.clone_from(&self.spare);
-        let expected = "one that leaves velocities and accelerations below 1e100";
-        Err(StepError::Input { what: "impulse", expected, got: impulse.norm() })
-    }
-
-    /// Adds the modal force of a force (N, world axes) on a surface vertex to `modal`.
-    ///
-    /// The modal force uses the derivative of the vertex position. Returns the arm of the vertex
-    /// from the center of mass, m, world axes.
-    fn press(&self, vertex: u32, force: &Vector3<f64>, modal: &mut [f64]) -> Result<Vector3<f64>, StepError> {
-        let model = self.model();
-        let surface = model.surface().positions();
-        let count = surface.len();
-        let Some(rest) = surface.get(vertex as usize) else {
-            return Err(StepError::Vertex { vertex, count });
-        };
-        let row =
-            |row: Row, mode: usize| Vector3::from_fn(|axis, _| f64::from(row(model, vertex, axis, mode)));
-        let (shift, turn): (Row, Row) = (ModalModel::displacement_row, ModalModel::rotation_row);
-        let sum = |of: Row| -> Vector3<f64> {
-            self.state.q.iter().enumerate().map(|(mode, q)| *q * row(of, mode)).sum()
-        };
-        let warp = self.kernel.warps();
-        let (d, w) = (sum(shift), if warp { sum(turn) } else { Vector3::zeros() });
-        let (moved, tangent) = tangent(&Six::new(d.x, d.y, d.z, w.x, w.y, w.z), warp);
-        let rotation = self.state.frame.rotation();
-        let six = tangent.tr_mul(&(rotation.inverse() * force));
-        let (by_d, by_w) = (six.fixed_rows::<3>(0), six.fixed_rows::<3>(3));
-        for (mode, modal) in modal.iter_mut().enumerate() {
-            *modal += row(shift, mode).dot(&by_d);
-            if warp {
-                *modal += row(turn, mode).dot(&by_w);
-            }
-        }
-        let at = Vector3::from(rest.map(f64::from)) + moved;
-        Ok(rotation * (at - Vector3::from(model.center_of_mass())))
+        self.kernel.apply_impulse(&mut self.state, &mut self.spare, vertex, impulse)
     }
 
     /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J.
@@ -646,7 +584,7 @@ impl Body {
     /// Performs one step without other bodies, after [`Body::begin_step`].
     pub(crate) fn step_alone(&mut self) -> Result<StepReport, StepError> {
         let (force, torque) = (self.push_force, self.push_torque);
-        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame_is_given: false };
+        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame: None };
         self.kernel.step_touching(&mut self.state, &mut self.hands, &load, &mut self.contacts)
     }
 
@@ -680,7 +618,7 @@ impl Body {
     /// What a step with others changes.
     pub(crate) fn parts<'a>(&'a mut self, report: &'a mut StepReport) -> Parts<'a> {
         let (force, torque) = (self.push_force, self.push_torque);
-        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame_is_given: false };
+        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame: None };
         Parts {
             kernel: &mut self.kernel,
             state: &mut self.state,
@@ -694,7 +632,7 @@ impl Body {
     /// What a step with others reads.
     pub(crate) fn view(&self) -> View<'_> {
         let (force, torque) = (self.push_force, self.push_torque);
-        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame_is_given: false };
+        let load = Load { modal: &self.pushes, force, torque, motion: self.motion, frame: None };
         View { kernel: &self.kernel, state: &self.state, hands: &self.hands, load, contacts: &self.contacts }
     }
 
@@ -702,6 +640,3 @@ impl Body {
         self.grabs.iter().position(|g| g.id == id).ok_or(StepError::NoGrab)
     }
 }
-
-/// Accessor for basis rows, with the arguments vertex, axis and mode.
-type Row = fn(&ModalModel, u32, usize, usize) -> f32;

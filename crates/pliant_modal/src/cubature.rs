@@ -268,12 +268,12 @@ struct Equations {
     law: Hyperelastic,
     at_rest: SMatrix<f64, 9, 9>,
     roots: Vec<f64>,
-    blocks: Vec<Block>,
+    blocks: Vec<CandidateBlock>,
     /// `[block][coordinate][lane]`.
     target: Vec<f64>,
 }
 
-struct Block {
+struct CandidateBlock {
     at: Vec<Lane>,
     scale: Lane,
     is_small: bool,
@@ -297,7 +297,7 @@ impl Equations {
                 }
             }
             target.extend(totals.iter().flat_map(|total| total.0));
-            blocks.push(Block { at, scale, is_small });
+            blocks.push(CandidateBlock { at, scale, is_small });
         };
         for (shapes, forces) in fit.shapes.chunks(LANES).zip(fit.forces.chunks(LANES)) {
             let scales: Vec<f64> = forces.iter().map(|total| 1.0 / weighed(total).max(1e-300)).collect();

@@ -19,6 +19,9 @@ pub struct Together<'a> {
     /// Whether the body rests. A resting body is not stepped unless a body that moves is near it,
     /// directly or through others. [`Islands::step`] then sets this to false.
     pub resting: bool,
+    /// Whether the body may touch others, or probes. One that may not costs no search for what is
+    /// near it. Default: true.
+    pub touches: bool,
     /// Set by a step: number of the body's island. Bodies with the same number may touch, directly
     /// or through others, and may come to rest only together.
     pub island: usize,
@@ -26,16 +29,33 @@ pub struct Together<'a> {
     pub report: StepReport,
     /// Set by a step that fails: why.
     pub error: Option<StepError>,
+    /// Whether the body is stepped now, and near no other body or probe.
+    lone: bool,
 }
 
 impl<'a> Together<'a> {
-    /// A body that moves.
+    /// A body that moves and may touch others.
     pub fn new(key: u64, body: &'a mut Body) -> Self {
-        Self { body, key, resting: false, island: 0, report: StepReport::default(), error: None }
+        Self {
+            body,
+            key,
+            resting: false,
+            touches: true,
+            island: 0,
+            report: StepReport::default(),
+            error: None,
+            lone: false,
+        }
     }
 }
 
 impl Together<'_> {
+    fn begin_step(&mut self) {
+        self.report = StepReport::default();
+        self.body.contacts_mut().key = self.key;
+        self.body.begin_step();
+    }
+
     fn step_alone(&mut self) {
         match self.body.step_alone() {
             Ok(report) => self.report = report,
@@ -156,15 +176,38 @@ impl Islands {
         may_touch: impl Fn(usize, usize) -> bool,
         may_probe: impl Fn(usize, usize) -> bool,
     ) {
+        self.step_by(bodies, probes, h, may_touch, may_probe, |bodies, step| {
+            bodies.iter_mut().for_each(step);
+        });
+    }
+
+    /// As [`Islands::step_with`], where `each` calls its second argument for each body of its
+    /// first, in any order and on any threads. The result is the same to the bit. The bodies that
+    /// are near no other body are stepped in it.
+    pub fn step_by<'a>(
+        &mut self,
+        bodies: &mut [Together<'a>],
+        probes: &mut [Probe],
+        h: f64,
+        may_touch: impl Fn(usize, usize) -> bool,
+        may_probe: impl Fn(usize, usize) -> bool,
+        each: impl FnOnce(&mut [Together<'a>], fn(&mut Together<'a>)),
+    ) {
         self.work.begin_step();
         self.find_pairs(bodies, &may_touch);
         self.find_probed(bodies, probes, h, &may_probe);
         self.find_islands(bodies, probes);
         self.wake(bodies, probes);
-        for together in bodies.iter_mut().filter(|together| !together.resting) {
-            together.report = StepReport::default();
-            together.body.contacts_mut().key = together.key;
-            together.body.begin_step();
+        self.find_lone(bodies, probes);
+        each(bodies, |together| {
+            if together.lone {
+                together.begin_step();
+                together.step_alone();
+                together.body.end_step();
+            }
+        });
+        for together in bodies.iter_mut().filter(|together| !together.resting && !together.lone) {
+            together.begin_step();
         }
         let mut begin = 0;
         while begin < self.order.len() {
@@ -181,7 +224,7 @@ impl Islands {
                 let _ = group::step(bodies, &[], &[], &mut [], held, &mut self.work);
             }
         }
-        for together in bodies.iter_mut().filter(|together| !together.resting) {
+        for together in bodies.iter_mut().filter(|together| !together.resting && !together.lone) {
             together.body.end_step();
         }
     }
@@ -194,17 +237,13 @@ impl Islands {
         (probes, h): (&mut [Probe], f64),
     ) {
         let who = &self.order[begin..end];
-        if who.first().is_none_or(|&first| bodies[first].resting) {
+        if who.first().is_none_or(|&first| bodies[first].resting || bodies[first].lone) {
             return;
         }
         self.held.clear();
         let of_island =
             |probe: &Probe| probe.near.first().is_some_and(|&n| self.first[n] == self.first[who[0]]);
         self.held.extend((0..probes.len()).filter(|&index| of_island(&probes[index])));
-        if let ([one], true) = (who, self.held.is_empty()) {
-            bodies[*one].step_alone();
-            return;
-        }
         self.members.clear();
         if self.sixes.len() < who.len() {
             self.sixes.resize_with(who.len(), Default::default);
@@ -232,14 +271,15 @@ impl Islands {
     fn find_pairs(&mut self, bodies: &[Together<'_>], may_touch: &impl Fn(usize, usize) -> bool) {
         self.pairs.clear();
         self.balls.clear();
-        self.balls.extend(bodies.iter().enumerate().map(|(index, together)| Ball::of(index, together.body)));
+        let touching = bodies.iter().enumerate().filter(|(_, together)| together.touches);
+        self.balls.extend(touching.map(|(index, together)| Ball::of(index, together.body)));
         self.balls.retain(|ball| ball.ends().iter().all(|x| x.is_finite()));
         self.balls.sort_unstable_by(|a, b| a.ends()[0].total_cmp(&b.ends()[0]).then(a.index.cmp(&b.index)));
         for (number, a) in self.balls.iter().enumerate() {
             let [_, end] = a.ends();
             for b in self.balls[number + 1..].iter().take_while(|b| b.ends()[0] <= end) {
                 let (i, j) = (a.index.min(b.index), a.index.max(b.index));
-                if a.meets(b) && may_touch(i, j) {
+                if may_touch(i, j) && a.meets(b) {
                     self.pairs.push([i as u32, j as u32]);
                 }
             }
@@ -289,6 +329,19 @@ impl Islands {
         }
         for together in bodies.iter_mut() {
             together.resting = !self.moves[together.island];
+        }
+    }
+
+    /// Finds the bodies that move, and that are their whole island.
+    fn find_lone(&mut self, bodies: &mut [Together<'_>], probes: &[Probe]) {
+        for together in bodies.iter_mut() {
+            together.lone = !together.resting;
+        }
+        for pair in &self.pairs {
+            pair.iter().for_each(|&index| bodies[index as usize].lone = false);
+        }
+        for &near in probes.iter().flat_map(|probe| &probe.near) {
+            bodies[near].lone = false;
         }
     }
 

@@ -9,11 +9,11 @@ use crate::{Coefficients, Integrator, StepError, exponential::exponential};
 /// left.
 ///
 /// ```text
-/// q'' + c q' + omega^2 (q - ratio z) = f        z: the modal flow, how far the dashpot has gone
+/// q'' + c q' + omega^2 (q - ratio z) = f        z: the viscoelastic state, how far the dashpot has gone
 /// time z' = q - z
 /// ```
 ///
-/// Here `z` is the viscoelastic state of the mode (the modal flow). The stress under a held strain
+/// Here `z` is the viscoelastic state of the mode. The stress under a held strain
 /// falls as [`modulus`](Self::modulus), and the strain under a held stress grows as
 /// [`creep`](Self::creep). The branch stores `ratio omega^2 (q - z)^2 / 2` and loses
 /// `ratio omega^2 (q - z)^2 / time`.

@@ -92,13 +92,15 @@ fn dampers_take_energy() {
     let times = [0.0, 0.01, 0.1, 0.5, 2.0, 10.0];
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
     for (integrator, second_order) in [(Integrator::Exact, true), (Integrator::Exact, false), (alpha, true)] {
-        // Under warp, with dampers of ten seconds, the rows of a first-order step lag: it gains
-        // 3.3e-4 of the energy for a moment. Hands from a network have a second at most.
-        let room = if second_order { 1e-4 } else { 5e-4 };
         for step in [1.0 / 40.0, 1.0 / 240.0] {
             for warp in [false, true] {
                 for first in times {
                     for second in times {
+                        // The rows of a first-order step lag behind the warp: with two dampers of
+                        // ten seconds it gains 2.0e-4 of the energy for a moment. Hands from a
+                        // network have a second at most. Nothing else gains 1e-9.
+                        let lags = warp && !second_order && f64::min(first, second) > 2.0;
+                        let room = if lags { 3e-4 } else { 1e-9 };
                         let (mut body, grabs) = held(step, integrator, second_order, warp, [first, second]);
                         let starts = grabs.map(|grab| body.target(grab).unwrap());
                         let mut least = f64::INFINITY;

@@ -63,6 +63,82 @@ pub struct ContactReport {
     pub guarded: bool,
 }
 
+/// What a contact with an obstacle leaves for the next step.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ContactMemory {
+    /// Index of the obstacle in the body's list.
+    pub obstacle: u16,
+    /// Number of the contact site.
+    pub site: u16,
+    /// Force on the body over the step, N, world axes.
+    pub force: [f64; 3],
+    /// Where the surface of the site sticks, m, world axes.
+    pub anchor: [f64; 3],
+    /// Direction from the center of the site to its contact point, body axes. Zero for a site that
+    /// is not round.
+    pub toward: [f64; 3],
+}
+
+/// What the contacts of a step with obstacles leave for the next. It belongs to the
+/// [`State`](crate::State): who takes over a state, or returns to one, takes over both
+/// ([`Contacts::recall`]).
+///
+/// Contacts with other bodies are not in it. They begin anew.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+pub struct ContactState {
+    /// Weight of a contact force in the way of the frame within a step, 0.5 to 1.
+    pub weight: f64,
+    /// Energy that steps with contacts have lost and not gained since, J.
+    pub lost: f64,
+    /// The contacts that carried force.
+    pub memory: Vec<ContactMemory>,
+}
+
+impl Default for ContactState {
+    /// No contacts.
+    fn default() -> Self {
+        Self { weight: 0.5, lost: 0.0, memory: Vec::new() }
+    }
+}
+
+impl Clone for ContactState {
+    fn clone(&self) -> Self {
+        Self { memory: self.memory.clone(), ..*self }
+    }
+
+    /// Copies into the memory that is there, because every tick is remembered.
+    fn clone_from(&mut self, from: &Self) {
+        let Self { weight, lost, memory } = from;
+        (self.weight, self.lost) = (*weight, *lost);
+        self.memory.clone_from(memory);
+    }
+}
+
+impl ContactState {
+    /// Largest number of contacts that a state may have.
+    pub const MAX: usize = 1024;
+
+    /// Whether all numbers are in their ranges, forces and positions up to 1e9, and each place is
+    /// there once, in the order of obstacles and sites. What has crossed a network is checked with
+    /// this.
+    pub fn is_valid(&self) -> bool {
+        let near = |x: &[f64; 3]| x.iter().all(|x| x.abs() <= 1e9);
+        let unit = |x: &[f64; 3]| x.iter().all(|x| x.abs() <= 1.0 + 1e-6);
+        let sound = |m: &ContactMemory| near(&m.force) && near(&m.anchor) && unit(&m.toward);
+        let place = |m: &ContactMemory| (m.obstacle, m.site);
+        (0.5..=1.0).contains(&self.weight)
+            && (0.0..=1e9).contains(&self.lost)
+            && self.memory.len() <= Self::MAX
+            && self.memory.iter().all(sound)
+            && self.memory.is_sorted_by(|a, b| place(a) < place(b))
+    }
+
+    /// Forgets all contacts.
+    pub fn forget(&mut self) {
+        self.clone_from(&Self::default());
+    }
+}
+
 /// What one copy of a body may touch, and what the contacts of the last step left for the next.
 ///
 /// It belongs to the state of the body: whoever steps a [`State`](crate::State) with contacts keeps
@@ -79,7 +155,7 @@ pub struct Contacts {
     pub(crate) memory: Vec<Memory>,
     pub(crate) touching: Touching,
     pub(crate) bent: Bent,
-    /// Pull, mean pull and flow of the hands before the step.
+    /// Pull, mean pull and viscoelastic state of the hands before the step.
     pub(crate) hands: Vec<[Vector3<f64>; 3]>,
     /// Weight of a contact force in the way of the frame within a step, see the kernel.
     pub(crate) theta: f64,
@@ -177,6 +253,38 @@ impl Contacts {
         self.report = ContactReport::default();
         self.theta = 0.5;
         self.lost = 0.0;
+    }
+
+    /// Writes what the contacts with obstacles have left for the next step.
+    pub fn remember(&self, into: &mut ContactState) {
+        (into.weight, into.lost) = (self.theta, self.lost);
+        into.memory.clear();
+        into.memory.extend(self.memory.iter().filter_map(|memory| {
+            let Touched::Obstacle(obstacle) = memory.other else { return None };
+            Some(ContactMemory {
+                obstacle: u16::try_from(obstacle).ok()?,
+                site: u16::try_from(memory.site).ok()?,
+                force: memory.force.into(),
+                anchor: memory.anchor.into(),
+                toward: memory.toward.into(),
+            })
+        }));
+        into.memory.truncate(ContactState::MAX);
+    }
+
+    /// Takes over what contacts have left for the next step, in place of everything that the last
+    /// step left. Contacts of obstacles or sites that the body lacks have no effect.
+    pub fn recall(&mut self, from: &ContactState) {
+        self.forget();
+        (self.theta, self.lost) = (from.weight, from.lost);
+        self.memory.extend(from.memory.iter().map(|memory| Memory {
+            other: Touched::Obstacle(usize::from(memory.obstacle)),
+            site: usize::from(memory.site),
+            force: memory.force.into(),
+            anchor: memory.anchor.into(),
+            toward: memory.toward.into(),
+            place: None,
+        }));
     }
 
     /// Keeps what the hands have before a step.

@@ -22,6 +22,7 @@
 
 mod cone;
 mod contacts;
+mod fixed;
 mod obstacle;
 mod point;
 mod probe;
@@ -31,11 +32,12 @@ mod solver;
 mod surface_field;
 
 pub use cone::contact_force;
-pub use contacts::{Contact, ContactReport, Contacts, Touched};
+pub use contacts::{Contact, ContactMemory, ContactReport, ContactState, Contacts, Touched};
+pub use fixed::{FixedObstacle, FixedShape};
 pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint};
 pub use probe::{Probe, ProbeConfig, ProbeContact};
 
-pub(crate) use point::{AtProbe, Far, Memory, Point};
+pub(crate) use point::{AtProbe, ContactPoint, Far, Memory};
 pub(crate) use probe::{Grown, ProbeMemory};
 pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};

@@ -2,6 +2,7 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 
+use super::{FixedObstacle, FixedShape};
 use crate::{StepError, error::finite};
 
 /// Distance and direction from a point to the surface of an obstacle.
@@ -36,6 +37,12 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
     /// Returns [`StepError::Input`] for a number that is not finite or out of range.
     fn check(&self) -> Result<(), StepError> {
         Ok(())
+    }
+
+    /// The obstacle as plain data, which other machines can have. Default: `None`, for a shape that
+    /// has no such form. An obstacle that moves has none.
+    fn fixed(&self) -> Option<FixedObstacle> {
+        None
     }
 }
 
@@ -76,6 +83,10 @@ impl ObstacleShape for Plane {
         let sound = length >= 1e-9 && length.is_finite();
         StepError::check("normal of a plane", "a length of 1e-9 or more", sound, length)
     }
+
+    fn fixed(&self) -> Option<FixedObstacle> {
+        Some(FixedObstacle::upright(FixedShape::Plane, self.point, self.normal))
+    }
 }
 
 /// A ball.
@@ -96,6 +107,11 @@ impl ObstacleShape for Sphere {
     fn check(&self) -> Result<(), StepError> {
         finite("center of a sphere", &self.center)?;
         not_negative("radius of a sphere", self.radius)
+    }
+
+    fn fixed(&self) -> Option<FixedObstacle> {
+        let shape = FixedShape::Ball { radius: self.radius };
+        Some(FixedObstacle { shape, position: self.center, ..FixedObstacle::GROUND })
     }
 }
 
@@ -124,6 +140,12 @@ impl ObstacleShape for Capsule {
     fn check(&self) -> Result<(), StepError> {
         finite("end of a capsule", self.ends.as_flattened())?;
         not_negative("radius of a capsule", self.radius)
+    }
+
+    fn fixed(&self) -> Option<FixedObstacle> {
+        let [a, b] = self.ends.map(Vector3::from);
+        let shape = FixedShape::Capsule { radius: self.radius, half_length: 0.5 * (b - a).norm() };
+        Some(FixedObstacle::upright(shape, (0.5 * (a + b)).into(), (b - a).into()))
     }
 }
 
@@ -174,6 +196,12 @@ impl ObstacleShape for Cuboid {
         self.half.iter().try_for_each(|half| not_negative("half an edge of a box", *half))?;
         not_negative("rounding of a box", self.round)
     }
+
+    fn fixed(&self) -> Option<FixedObstacle> {
+        let turn = self.turn();
+        let shape = FixedShape::Box { half: self.half, round: self.round };
+        Some(FixedObstacle { shape, position: self.center, rotation: [turn.i, turn.j, turn.k, turn.w] })
+    }
 }
 
 /// An obstacle that is told in its own axes, with a pose and a motion.
@@ -214,6 +242,18 @@ impl<O: ObstacleShape> ObstacleShape for Moving<O> {
         let sound = length > 1e-9 && length.is_finite();
         StepError::check("rotation of an obstacle", "a quaternion of non-zero length", sound, length)?;
         self.shape.check()
+    }
+
+    fn fixed(&self) -> Option<FixedObstacle> {
+        let still = self.velocity == [0.0; 3] && self.angular_velocity == [0.0; 3];
+        let FixedObstacle { shape, position, rotation } = self.shape.fixed().filter(|_| still)?;
+        let of = |[x, y, z, w]: [f64; 4]| {
+            UnitQuaternion::try_new(nalgebra::Quaternion::new(w, x, y, z), 1e-9).unwrap_or_default()
+        };
+        let turn = of(self.rotation);
+        let position = turn * Vector3::from(position) + Vector3::from(self.position);
+        let turn = turn * of(rotation);
+        Some(FixedObstacle { shape, position: position.into(), rotation: [turn.i, turn.j, turn.k, turn.w] })
     }
 }
 

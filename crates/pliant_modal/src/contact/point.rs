@@ -36,7 +36,7 @@ pub(crate) struct Far {
     /// Position of the place's material at the beginning and at the end of the step, m, world axes.
     pub(crate) start: Vector3<f64>,
     pub(crate) end: Vector3<f64>,
-    /// As for [`Point`].
+    /// As for [`ContactPoint`].
     pub(crate) tangent: Tangent,
     pub(crate) mean: Option<Tangent>,
     /// Where the force acts, m, world axes: the middle of the contact over the step. Arms of both
@@ -66,7 +66,7 @@ pub(crate) struct AtProbe {
 
 /// A place that touches, or may touch, in this step.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Point {
+pub(crate) struct ContactPoint {
     /// The body of the site, as an index into the group.
     pub(crate) member: usize,
     pub(crate) site: usize,
@@ -121,7 +121,7 @@ pub(crate) struct Point {
     pub(crate) arm: Vector3<f64>,
 }
 
-impl Point {
+impl ContactPoint {
     pub(crate) fn new(member: usize, site: usize, other: Touched, friction: f64) -> Self {
         let zero = Vector3::zeros();
         Self {

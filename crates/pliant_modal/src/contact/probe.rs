@@ -222,7 +222,7 @@ impl Probe {
     }
 
     /// Moves the ball to where a force on it (N, world axes) lets it be at the end of the step.
-    pub(crate) fn settle(&mut self, force: &Vector3<f64>) {
+    pub(crate) fn respond(&mut self, force: &Vector3<f64>) {
         self.position = self.free + self.compliance * force;
     }
 

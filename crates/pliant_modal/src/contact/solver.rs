@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, RowVector3, Vector3};
 
 use super::{
     cone::{self, Status},
-    point::Point,
+    point::ContactPoint,
 };
 use crate::{simd::dot, step::Frame};
 
@@ -47,7 +47,7 @@ pub(crate) struct Look {
 /// Workspace of the contacts of a group of bodies in a step.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Touching {
-    pub(crate) points: Vec<Point>,
+    pub(crate) points: Vec<ContactPoint>,
     /// One span per body.
     pub(crate) spans: Vec<Span>,
     /// The sides of each point. Each has three rows of one entry per coordinate of its body, such
@@ -91,7 +91,7 @@ impl Touching {
 
     /// Largest violation of the laws at the end of the last computed step, m.
     pub(crate) fn violation(&self) -> f64 {
-        self.points.iter().map(Point::violation).fold(0.0, f64::max)
+        self.points.iter().map(ContactPoint::violation).fold(0.0, f64::max)
     }
 
     /// Reserves memory for a number of points and sites of a body alone.

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, Vector3};
 
 use super::{
-    region::{Load, Region},
+    region::{NodeLoad, Region},
     thinned,
 };
 use crate::{
@@ -72,7 +72,7 @@ impl Columns {
     pub(super) fn new(
         model: &ModalModel,
         region: &Region<'_>,
-        loads: &[Load],
+        loads: &[NodeLoad],
         law: Hyperelastic,
     ) -> Option<Self> {
         let width = 9 * loads.len();
@@ -109,7 +109,7 @@ impl Columns {
         self,
         model: &ModalModel,
         region: &Region<'_>,
-        loads: &[Load],
+        loads: &[NodeLoad],
         law: Hyperelastic,
     ) -> Option<(Self, Vec<(usize, GuidedShape)>)> {
         let outside = thinned(&region.outside(model.size(), OUTSIDE), POINTS[0]);
@@ -250,7 +250,7 @@ impl Columns {
     }
 
     /// Mean displacements of loads by columns and coordinates.
-    pub(super) fn rows(&self, region: &Region<'_>, loads: &[Load]) -> Vec<Rows> {
+    pub(super) fn rows(&self, region: &Region<'_>, loads: &[NodeLoad]) -> Vec<Rows> {
         let row = |load| {
             let (mut own, modal) = region.mean(load, &self.values, self.width);
             own.iter_mut().zip(&modal).for_each(|(own, modal)| self.take_out(modal, own));

@@ -36,7 +36,7 @@ pub use mesh::{SimulationMesh, VertexPlace};
 
 use self::{
     columns::Columns,
-    region::{Load, Place, Region},
+    region::{NodeLoad, Region, WeightedPoint},
 };
 use crate::{
     HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, StepError,
@@ -127,7 +127,7 @@ impl HeldShapes {
         if !region.is_held() {
             return Ok(None);
         }
-        let loads: Vec<Load> = patches.iter().map(|patch| region.load(patch)).collect();
+        let loads: Vec<NodeLoad> = patches.iter().map(|patch| region.load(patch)).collect();
         let columns = Columns::new(model, &region, &loads, law)
             .and_then(|columns| columns.corrected(model, &region, &loads, law));
         let Some((columns, shapes)) = columns else { return Ok(None) };
@@ -317,13 +317,13 @@ fn rule(
 }
 
 /// Returns about `most` of the points, evenly from the list, with weights whose sum stays.
-fn thinned(places: &[Place], most: usize) -> Vec<Place> {
+fn thinned(places: &[WeightedPoint], most: usize) -> Vec<WeightedPoint> {
     let stride = places.len().div_ceil(most).max(1);
     let groups = places.chunks(stride).enumerate();
     groups
         .map(|(group, members)| {
             let weight = members.iter().map(|place| place.weight).sum();
-            Place { weight, ..members[(group * 7919) % members.len()] }
+            WeightedPoint { weight, ..members[(group * 7919) % members.len()] }
         })
         .collect()
 }

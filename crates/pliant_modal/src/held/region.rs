@@ -35,7 +35,7 @@ const CORRECTED: f64 = 1e-2;
 
 /// A quadrature point of an element of the mesh with its weight, m^3.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct WeightedPoint {
     pub(super) element: u32,
     pub(super) point: usize,
     pub(super) weight: f64,
@@ -60,7 +60,7 @@ pub(super) struct Region<'a> {
 }
 
 /// Node numbers with shares of a load.
-pub(super) type Load = Vec<(u32, f64)>;
+pub(super) type NodeLoad = Vec<(u32, f64)>;
 
 impl<'a> Region<'a> {
     pub(super) fn new(
@@ -166,8 +166,8 @@ impl<'a> Region<'a> {
     }
 
     /// Spreads the weights of a patch over the nodes of the mesh.
-    pub(super) fn load(&self, patch: &Patch) -> Load {
-        let mut out: Load = Vec::new();
+    pub(super) fn load(&self, patch: &Patch) -> NodeLoad {
+        let mut out: NodeLoad = Vec::new();
         for &(vertex, weight) in patch.entries() {
             self.vertex(vertex, &mut |node, share| out.push((node, weight * share)));
         }
@@ -183,7 +183,7 @@ impl<'a> Region<'a> {
     }
 
     /// Mean displacement of a load's nodes by the columns and by the coordinates, `[axis][..]`.
-    pub(super) fn mean(&self, load: &Load, columns: &[f64], width: usize) -> (Rows, Rows) {
+    pub(super) fn mean(&self, load: &NodeLoad, columns: &[f64], width: usize) -> (Rows, Rows) {
         let modes = self.mesh.scales.len();
         let mut own: Rows = std::array::from_fn(|_| vec![0.0; width]);
         let mut modal: Rows = std::array::from_fn(|_| vec![0.0; modes]);
@@ -242,7 +242,7 @@ impl<'a> Region<'a> {
 
     /// The static shape of each axis of a load on the patch with this index, and the shapes of
     /// second order of all six pairs of them: nine columns, `[node][axis][column]`.
-    pub(super) fn static_shapes(&self, index: usize, load: &Load, law: Hyperelastic) -> Vec<f64> {
+    pub(super) fn static_shapes(&self, index: usize, load: &NodeLoad, law: Hyperelastic) -> Vec<f64> {
         let nodes = self.node_count();
         let mut first = vec![0.0; 9 * nodes];
         for &(node, share) in load {
@@ -273,7 +273,7 @@ impl<'a> Region<'a> {
     pub(super) fn corrections(
         &self,
         index: usize,
-        load: &Load,
+        load: &NodeLoad,
         shapes: &[&GuidedShape],
         columns: &Columns,
         law: Hyperelastic,
@@ -323,7 +323,7 @@ impl<'a> Region<'a> {
         columns: &Columns,
         shapes: &[Vec<f64>],
         law: Hyperelastic,
-        outside: &[Place],
+        outside: &[WeightedPoint],
     ) -> Vec<Vec<f64>> {
         let per = self.kind.node_count();
         let points = tetrahedron::stiffness_points(self.kind).0.len() as f64;
@@ -487,12 +487,12 @@ impl<'a> Region<'a> {
 
     /// Gradients of the columns and of the coordinates after them at quadrature points of elements
     /// of the mesh, with the points' weights. `rows` are the [`Region::node_rows`].
-    pub(super) fn points(&self, places: &[Place], columns: &Columns, rows: &[f64]) -> Vec<Point> {
+    pub(super) fn points(&self, places: &[WeightedPoint], columns: &Columns, rows: &[f64]) -> Vec<Point> {
         let per = self.kind.node_count();
         let all = columns.width + self.mesh.scales.len();
         let (points, _) = tetrahedron::stiffness_points(self.kind);
         let mut outer = vec![0.0; 3 * all];
-        let make = |place: &Place| {
+        let make = |place: &WeightedPoint| {
             let affine = self.affine_of(place.element);
             let g = affine.shape_gradients(self.kind, points[place.point % points.len()]);
             let nodes = &self.connectivity[place.element as usize * per..][..per];
@@ -515,18 +515,18 @@ impl<'a> Region<'a> {
     }
 
     /// All quadrature points of the region's elements.
-    pub(super) fn inside(&self) -> Vec<Place> {
+    pub(super) fn inside(&self) -> Vec<WeightedPoint> {
         let points = tetrahedron::stiffness_points(self.kind).0.len();
         let make = |(&element, affine): (&u32, &Affine)| {
             let weight = affine.volume / points as f64;
-            (0..points).map(move |point| Place { element, point, weight })
+            (0..points).map(move |point| WeightedPoint { element, point, weight })
         };
         self.elements.iter().zip(&self.affine).flat_map(make).collect()
     }
 
     /// At most about `most` quadrature points outside of the region, spread over the body, with
     /// weights whose sum is the volume there.
-    pub(super) fn outside(&self, size: f64, most: usize) -> Vec<Place> {
+    pub(super) fn outside(&self, size: f64, most: usize) -> Vec<WeightedPoint> {
         let mut order: Vec<((i64, [i64; 3]), u32, f64)> = (0..self.mesh.tets.len() as u32)
             .filter(|element| self.elements.binary_search(element).is_err())
             .map(|element| {
@@ -545,7 +545,7 @@ impl<'a> Region<'a> {
                 // All points of one element of each group, for the volume of the group.
                 let weight = members.iter().map(|(_, _, volume)| volume).sum::<f64>() / points as f64;
                 let (_, element, _) = members[(group * 7919) % members.len()];
-                (0..points).map(move |point| Place { element, point, weight })
+                (0..points).map(move |point| WeightedPoint { element, point, weight })
             })
             .collect()
     }

@@ -22,12 +22,12 @@ const WIDTH: usize = 16;
 /// Number of rows of the tangent that are computed at once.
 const ROWS: usize = 4;
 
-/// Gradients of a model's cubature in double precision, padded to whole blocks: the shared part of
-/// all copies of a body.
+/// Gradients of a model's cubature, padded to whole blocks: the shared part of all copies of a
+/// body.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Gradients {
     padded: usize,
-    values: Vec<f64>,
+    values: Vec<f32>,
     /// The same, each column divided by the frequency of its coordinate (rad/s).
     scaled: Vec<f32>,
 }
@@ -40,7 +40,7 @@ impl Gradients {
         let outs = values.chunks_exact_mut(padded).zip(scaled.chunks_exact_mut(padded));
         for (row, (values, scaled)) in gradients.chunks_exact(omega.len()).zip(outs) {
             for (k, (&x, omega)) in row.iter().zip(omega).enumerate() {
-                values[k] = f64::from(x);
+                values[k] = x;
                 scaled[k] = (f64::from(x) / omega) as f32;
             }
         }
@@ -171,7 +171,7 @@ impl ElasticEnergy {
         self.q[given..].fill(0.0);
     }
 
-    fn points(&self) -> impl Iterator<Item = (f64, &[f64])> {
+    fn points(&self) -> impl Iterator<Item = (f64, &[f32])> {
         self.weights.iter().copied().zip(self.gradients.values.chunks_exact(9 * self.gradients.padded))
     }
 
@@ -196,8 +196,12 @@ impl ElasticEnergy {
     #[inline(always)]
     fn energy_with(&self, q: &[f64]) -> f64 {
         let (q, stride) = (&q[..self.modes.min(q.len())], self.gradients.padded);
-        let at = |(weight, rows): (f64, &[f64])| weight * self.law.energy(&gradient(rows, stride, q));
-        self.points().map(at).sum()
+        let mut sum = 0.0;
+        // A closure would not be compiled for the registers of this function.
+        for (weight, rows) in self.points() {
+            sum += weight * self.law.energy(&gradient(rows, stride, q));
+        }
+        sum
     }
 
     /// Writes the elastic force `dU/dq` at `q`, kg^1/2 m/s^2.
@@ -227,7 +231,7 @@ impl ElasticEnergy {
         for (weight, rows) in self.points() {
             let stress: Matrix3<f64> = weight * self.law.stress(&gradient(rows, stride, q));
             for (stress, row) in stress.iter().zip(rows.chunks_exact(stride)) {
-                out.iter_mut().zip(row).for_each(|(out, g)| *out = stress.mul_add(*g, *out));
+                out.iter_mut().zip(row).for_each(|(out, g)| *out = stress.mul_add(f64::from(*g), *out));
             }
         }
     }
@@ -302,8 +306,9 @@ impl ElasticEnergy {
             (0..3).for_each(|k| f[4 * k] = f[4 * k] + Lane::splat(1.0));
             let roots = positive_roots(self.law, &f);
             let points = weights.iter().zip(scaled.chunks_exact(9 * stride));
-            let outs = self.rows.chunks_exact_mut(9 * padded);
-            for (lane, ((&weight, rows), out)) in points.zip(outs).enumerate() {
+            let mut outs = self.rows.chunks_exact_mut(padded);
+            let mut kept = 0;
+            for (lane, (&weight, rows)) in points.enumerate() {
                 self.raised += usize::from(roots.least.0[lane] < 0.0);
                 let share = weight.sqrt();
                 let mut factors = [[0.0f32; 9]; 9];
@@ -312,10 +317,15 @@ impl ElasticEnergy {
                         *factor = (share * root.0[lane]) as f32;
                     }
                 }
-                combine(&factors, rows, stride, out, padded);
+                // Rows of eigenvalues that were raised to zero add nothing.
+                for factors in factors.iter().filter(|factors| factors.iter().any(|x| *x != 0.0)) {
+                    if let Some(out) = outs.next() {
+                        combine(factors, rows, stride, out);
+                        kept += 1;
+                    }
+                }
             }
-            let rows = &self.rows[..9 * padded * weights.len()];
-            add_squares(rows, modes, padded, &mut self.tangent);
+            add_squares(&self.rows[..padded * kept], modes, padded, &mut self.tangent);
         }
     }
 }
@@ -323,14 +333,14 @@ impl ElasticEnergy {
 /// Displacement gradient of a point, from its rows of `stride` entries, of which `q` may cover the
 /// first.
 #[inline(always)]
-fn gradient(rows: &[f64], stride: usize, q: &[f64]) -> Matrix3<f64> {
+fn gradient(rows: &[f32], stride: usize, q: &[f64]) -> Matrix3<f64> {
     let (rows, (q, tail)) = (rows.as_chunks::<LANES>().0, q.as_chunks::<LANES>());
     let blocks = stride / LANES;
     let mut sums = [[0.0f64; LANES]; 9];
     if !tail.is_empty() {
         for (row, sum) in rows.chunks_exact(blocks).zip(&mut sums) {
             for ((sum, row), q) in sum.iter_mut().zip(&row[q.len()]).zip(tail) {
-                *sum = row * q;
+                *sum = f64::from(*row) * q;
             }
         }
     }
@@ -338,7 +348,7 @@ fn gradient(rows: &[f64], stride: usize, q: &[f64]) -> Matrix3<f64> {
         for (e, sum) in sums.iter_mut().enumerate() {
             let row = &rows[e * blocks + block];
             for k in 0..LANES {
-                sum[k] = row[k].mul_add(q[k], sum[k]);
+                sum[k] = f64::from(row[k]).mul_add(q[k], sum[k]);
             }
         }
     }
@@ -351,7 +361,7 @@ fn gradient(rows: &[f64], stride: usize, q: &[f64]) -> Matrix3<f64> {
 
 /// Adds the force of a point with this stress times its weight.
 #[inline(always)]
-fn add_force(stress: &Matrix3<f64>, rows: &[f64], stride: usize, out: &mut [f64]) {
+fn add_force(stress: &Matrix3<f64>, rows: &[f32], stride: usize, out: &mut [f64]) {
     let (rows, out) = (rows.as_chunks::<LANES>().0, out.as_chunks_mut::<LANES>().0);
     let blocks = stride / LANES;
     for (block, out) in out.iter_mut().enumerate() {
@@ -359,31 +369,27 @@ fn add_force(stress: &Matrix3<f64>, rows: &[f64], stride: usize, out: &mut [f64]
         for e in 0..9 {
             let row = &rows[e * blocks + block];
             for k in 0..LANES {
-                sum[k] = stress[e].mul_add(row[k], sum[k]);
+                sum[k] = stress[e].mul_add(f64::from(row[k]), sum[k]);
             }
         }
         *out = sum;
     }
 }
 
-/// Writes `factors rows`: nine rows that are combinations of nine rows of a point.
+/// Writes the combination of nine rows of a point with these factors.
 #[inline(always)]
-fn combine(factors: &[[f32; 9]; 9], rows: &[f32], stride: usize, out: &mut [f32], padded: usize) {
+fn combine(factors: &[f32; 9], rows: &[f32], stride: usize, out: &mut [f32]) {
     let (rows, out) = (rows.as_chunks::<WIDTH>().0, out.as_chunks_mut::<WIDTH>().0);
-    let (from, to) = (stride / WIDTH, padded / WIDTH);
-    for block in 0..to {
-        let mut sums = [[0.0f32; WIDTH]; 9];
-        for e in 0..9 {
-            let row = rows[e * from + block];
-            for (factors, sum) in factors.iter().zip(&mut sums) {
-                for k in 0..WIDTH {
-                    sum[k] = factors[e].mul_add(row[k], sum[k]);
-                }
+    let from = stride / WIDTH;
+    for (block, out) in out.iter_mut().enumerate() {
+        let mut sum = [0.0f32; WIDTH];
+        for (e, factor) in factors.iter().enumerate() {
+            let row = &rows[e * from + block];
+            for k in 0..WIDTH {
+                sum[k] = factor.mul_add(row[k], sum[k]);
             }
         }
-        for (out, sum) in out.chunks_exact_mut(to).zip(&sums) {
-            out[block] = *sum;
-        }
+        *out = sum;
     }
 }
 

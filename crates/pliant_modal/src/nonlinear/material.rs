@@ -9,7 +9,7 @@ use super::lanes::{Lane, Number};
 
 /// Second derivative of the energy density by the deformation gradient, Pa. Row and column
 /// `3 c + r` belong to entry (r, c).
-type Tangent = SMatrix<f64, 9, 9>;
+type StressTangent = SMatrix<f64, 9, 9>;
 
 /// Law of the elastic energy for large strains.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -175,7 +175,7 @@ impl Hyperelastic {
                 let t = 2.0 * h.trace() + h.norm_squared();
                 let volume = SVector::<f64, 9>::from_column_slice(cofactor(&f).as_slice());
                 let all = SVector::<f64, 9>::from_column_slice(f.as_slice());
-                let mut out = Tangent::identity() * (mu * (3.0 + t) / (4.0 + t))
+                let mut out = StressTangent::identity() * (mu * (3.0 + t) / (4.0 + t))
                     + all * all.transpose() * (2.0 * mu / (4.0 + t).powi(2))
                     + volume * volume.transpose() * lambda;
                 // The cofactor's columns are the cross products of the columns of F.
@@ -193,7 +193,7 @@ impl Hyperelastic {
             Law::StVenantKirchhoff { lambda, mu } => {
                 let e = green_strain(h);
                 let s = lambda * e.trace() * Matrix3::identity() + 2.0 * mu * e;
-                let mut out = Tangent::zeros();
+                let mut out = StressTangent::zeros();
                 for column in 0..9 {
                     let mut df = Matrix3::zeros();
                     df[column] = 1.0;
@@ -412,7 +412,7 @@ mod tests {
             for h in gradients().into_iter().chain(gradients().into_iter().map(turn)).chain([flat]) {
                 // The nearest positive semidefinite matrix, from the eigenvalues of the tangent.
                 let eigen = law.tangent(&h).symmetric_eigen();
-                let up = Tangent::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0)));
+                let up = StressTangent::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0)));
                 let want = eigen.eigenvectors * up * eigen.eigenvectors.transpose();
                 let off = (positive_tangent(law, &h) - want).norm() / want.norm();
                 assert!(off < 1e-9, "{material:?} {h}: {off}");

@@ -14,7 +14,8 @@ pub struct GrabConfig {
     /// Stiffness of the hand's own spring (the coupling of the device), N/m, in series with the
     /// residual flexibility of the patch.
     ///
-    /// With `None` the hand is as stiff as the patch allows. Default: `None`.
+    /// With `None` the hand is as stiff as the patch allows. An infinite stiffness makes a rigid
+    /// constraint, see [`GrabConfig::RIGID`]. Default: `None`.
     pub stiffness: Option<f64>,
     /// Relaxation time of the coupling's damper, s, 0 or more. The coupling is
     /// `lambda = C^-1 (gap + relaxation d(gap)/dt)`. Default: 0.
@@ -28,6 +29,14 @@ impl Default for GrabConfig {
 }
 
 impl GrabConfig {
+    /// The hand of equation (4) of Tang et al. 2013: the patch is at the target at the end of each
+    /// step, `A lambda = x_target - x*`, without any compliance.
+    ///
+    /// This is for comparison only. Under [`Integrator::Newmark`](crate::Integrator::Newmark), the
+    /// paper's integrator, its force changes its sign in every step and grows, until it is that of
+    /// a pull from one size of the body away, the bound of all hands. A session replaces it by a
+    /// spring of [`GrabConfig::MAX_STIFFNESS`].
+    pub const RIGID: Self = Self { stiffness: Some(f64::INFINITY), relaxation: 0.0 };
     /// Largest stiffness accepted from a network, N/m. It is twenty times that of the stiffest
     /// devices (5,000 N/m), for tools that scale forces up.
     pub const MAX_STIFFNESS: f64 = 1e5;
@@ -47,13 +56,18 @@ impl GrabConfig {
         }
     }
 
+    /// Whether the hand is a rigid constraint, see [`GrabConfig::RIGID`].
+    pub fn is_rigid(&self) -> bool {
+        self.stiffness == Some(f64::INFINITY)
+    }
+
     /// Checks the ranges of both values.
     ///
     /// # Errors
-    /// Returns [`StepError::Input`] for a value that is not finite or out of range.
+    /// Returns [`StepError::Input`] for a value that is not a number or out of range.
     pub fn check(&self) -> Result<(), StepError> {
         if let Some(k) = self.stiffness {
-            StepError::check("grab stiffness", "finite N/m above 0", k.is_finite() && k > 0.0, k)?;
+            StepError::check("grab stiffness", "N/m above 0", k > 0.0, k)?;
         }
         let r = self.relaxation;
         StepError::check("grab relaxation", "finite seconds, 0 or more", r.is_finite() && r >= 0.0, r)
@@ -148,6 +162,9 @@ impl ViscoelasticPatch {
     ///
     /// `residual` is the residual flexibility of the hand's patch at the baked stiffness.
     pub(crate) fn compliance(&self, hand: &Hand, residual: Matrix3<f64>) -> Matrix3<f64> {
+        if hand.config().is_rigid() {
+            return Matrix3::zeros();
+        }
         let spring = hand.config().stiffness.map_or(0.0, |k| 1.0 / k);
         residual * (self.softness * self.at_once) + Matrix3::identity() * spring
     }
@@ -159,6 +176,9 @@ impl ViscoelasticPatch {
 
     /// Returns the viscoelastic state after a step under a force `pull` (N, body axes).
     pub(crate) fn step(&self, hand: &Hand, pull: &Vector3<f64>) -> Vector3<f64> {
+        if hand.config().is_rigid() {
+            return self.carry * hand.viscoelastic;
+        }
         self.carry * hand.viscoelastic + self.gain * (self.softness * (hand.patch.residual() * pull))
     }
 }
@@ -178,5 +198,10 @@ mod tests {
         assert!(real.stiffness == Some(2_000.0) && (real.relaxation - 0.015).abs() < 1e-8, "{real:?}");
         assert!(hand(Some(1e-300), 0.0).stiffness.is_some_and(|k| k > 0.0));
         assert_eq!(hand(None, 0.0), GrabConfig::default());
+        assert_eq!(GrabConfig::RIGID.capped().stiffness, Some(GrabConfig::MAX_STIFFNESS));
+        assert!(GrabConfig::RIGID.check().is_ok());
+        for bad in [f64::NAN, 0.0, -1.0, f64::NEG_INFINITY] {
+            assert!(GrabConfig { stiffness: Some(bad), relaxation: 0.0 }.check().is_err(), "{bad}");
+        }
     }
 }

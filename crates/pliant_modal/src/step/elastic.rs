@@ -222,6 +222,41 @@ impl ElasticStep {
         state.s.extend(self.q[..columns].iter().map(|s| if s.is_finite() { *s } else { 0.0 }));
     }
 
+    /// Takes the elastic energy beyond `most` (J) from a state without columns: from its
+    /// velocities, and where these do not suffice from its coordinates, along the force over the
+    /// stiffness at rest.
+    pub(crate) fn lower(&mut self, most: f64, state: &mut State) {
+        /// Maximum number of steps along the force, each of which ends beyond the goal where the
+        /// energy is linear.
+        const STEPS: usize = 16;
+        const BEYOND: f64 = 1.05;
+        let mut excess = self.energy.energy(&state.q) - most;
+        if excess.is_nan() || excess <= 0.0 {
+            return;
+        }
+        let kinetic: f64 = state.v.iter().map(|v| 0.5 * v * v).sum();
+        let left = if kinetic > excess { (1.0 - excess / kinetic).sqrt() } else { 0.0 };
+        state.v.iter_mut().for_each(|v| *v *= left);
+        let most = most + kinetic.min(excess);
+        let modal = self.omega2.len() - state.q.len();
+        for _ in 0..STEPS {
+            excess = self.energy.energy(&state.q) - most;
+            if excess.is_nan() || excess <= 0.0 {
+                return;
+            }
+            self.energy.force_at(&state.q, &mut self.way);
+            let pairs = || self.way.iter().zip(&self.omega2[modal..]);
+            let slope: f64 = pairs().map(|(force, omega2)| force * force / omega2).sum();
+            if slope.is_nan() || slope <= 0.0 {
+                return;
+            }
+            let share = BEYOND * excess / slope;
+            for (q, (force, omega2)) in state.q.iter_mut().zip(pairs()) {
+                *q -= share * force / omega2;
+            }
+        }
+    }
+
     /// Begins a step from `before`, with the step under the loads alone in `after`, and linearizes
     /// at its beginning. `load` is the modal force of the loads.
     pub(crate) fn begin(&mut self, before: &State, modes: &Modes, load: &[f64], after: &mut State) {
@@ -256,13 +291,13 @@ impl ElasticStep {
     }
 
     /// Solves the next round without hands. `First`: with the tangent of [`ElasticStep::begin`].
-    pub(crate) fn linearize(&mut self, tangent: Tangent) {
+    pub(crate) fn linearize(&mut self, tangent: RoundTangent) {
         match tangent {
-            Tangent::First => {}
-            Tangent::New => self.energy.linearize(&self.q),
-            Tangent::Kept => self.energy.compute_force(&self.q),
+            RoundTangent::First => {}
+            RoundTangent::New => self.energy.linearize(&self.q),
+            RoundTangent::Kept => self.energy.compute_force(&self.q),
         }
-        if tangent != Tangent::Kept {
+        if tangent != RoundTangent::Kept {
             self.factor();
             self.rows.clear();
         }
@@ -475,9 +510,9 @@ fn join(columns: usize, state: &State, out: &mut [f64]) {
 /// strain by two thousandths.
 const GUARDED: f64 = 1e-3;
 
-/// Tangent of a round.
+/// The tangent that a round uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Tangent {
+pub(crate) enum RoundTangent {
     /// That of the beginning of the step, computed by [`ElasticStep::begin`].
     First,
     /// Computed at the present coordinates.

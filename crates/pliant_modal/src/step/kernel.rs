@@ -3,6 +3,7 @@
 
 pub(crate) mod group;
 mod points;
+mod press;
 mod touch;
 
 use std::sync::Arc;
@@ -14,7 +15,7 @@ use group::{Parts, View};
 use super::{
     Frame, FrameMotion, Hand, Hold, RigidMotion, State, StepSettings,
     constraint::ViscoelasticPatch,
-    elastic::{ElasticStep, Tangent as ElasticTangent},
+    elastic::{ElasticStep, RoundTangent},
     gravity::{MassForce, between},
     modes::Modes,
     patch::{Grams, Six, Tangent, tangent},
@@ -44,9 +45,9 @@ pub struct Load<'a> {
     pub torque: Vector3<f64>,
     /// Motion of the anchors of an anchored body over the step. A free body ignores it.
     pub motion: FrameMotion,
-    /// Whether the frame of a free body is known from elsewhere. The step then leaves the frame as
-    /// it is in the state.
-    pub frame_is_given: bool,
+    /// The frame of a free body at the end of the step, if it is known from elsewhere. The step
+    /// then takes it as it is, and forces act on the modes alone.
+    pub frame: Option<Frame>,
 }
 
 /// Data of a hand during one step.
@@ -230,7 +231,9 @@ impl Kernel {
     ///
     /// Hands on other patches feel what the modes leave out as a compliance, as all hands do
     /// without shapes. The shapes of `state` come to rest under the forces of `hands`, so that
-    /// these go on as they were.
+    /// these go on as they were. A body that nobody holds any more gains no energy when its shapes
+    /// go: what it would gain is taken from its velocities, and where these do not suffice the
+    /// coordinates yield.
     ///
     /// # Errors
     /// Returns [`StepError::OtherModel`] for shapes of another model, and [`StepError::Length`] for
@@ -245,6 +248,7 @@ impl Kernel {
             return Err(StepError::OtherModel);
         }
         self.check_lengths(state)?;
+        let before = self.held_shapes().is_some().then(|| self.elastic_energy(state));
         state.s.clear();
         if self.elastic.is_none() {
             return Ok(());
@@ -252,6 +256,9 @@ impl Kernel {
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
         self.equilibrate_columns(state, hands);
+        if let (Some(most), Some(elastic), true) = (before, &mut self.elastic, hands.is_empty()) {
+            elastic.lower(most, state);
+        }
         Ok(())
     }
 
@@ -649,6 +656,9 @@ impl Kernel {
 
     fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
         let gravity = Vector3::from(self.settings.gravity);
+        if let Some(frame) = load.frame {
+            state.frame = frame;
+        }
         let on_mass = self.mass_force(&state.frame, &load.motion);
         let mut force = std::mem::take(&mut self.force);
         self.force_at_rest(&on_mass, &mut force);
@@ -663,7 +673,7 @@ impl Kernel {
         if self.bends_under(&on_mass) {
             self.bend_under(&on_mass, state);
         }
-        let rigid = (self.model.is_free() && !load.frame_is_given).then(|| {
+        let rigid = (self.model.is_free() && load.frame.is_none()).then(|| {
             let [force, torque] = self.push.at_once(load.force, load.torque);
             let rigid = RigidMotion::predict(&mut state.frame, &self.model, self.h, gravity, force, torque);
             self.push.add_rest(&mut state.frame, &self.model, self.h, force, gravity);
@@ -686,7 +696,7 @@ impl Kernel {
         let rounds = if curved { self.settings.corrections.clamp(1, most) } else { 1 };
         let mut report = StepReport::default();
         let mut place = PredictedFrame::unheld(state.frame);
-        let (mut round, mut tangent_of) = (0, ElasticTangent::First);
+        let (mut round, mut tangent_of) = (0, RoundTangent::First);
         loop {
             self.linearize(hands, tangent_of);
             let center = Vector3::from(self.model.center_of_mass());
@@ -709,8 +719,8 @@ impl Kernel {
                 let far = elastic.finish_round(patches.zip(self.solving.iter().map(|s| s.pull)));
                 report.projected = elastic.raised();
                 // A tangent serves two rounds, unless the first went far. Such a step goes on.
-                let keep = !far && tangent_of != ElasticTangent::Kept;
-                tangent_of = if keep { ElasticTangent::Kept } else { ElasticTangent::New };
+                let keep = !far && tangent_of != RoundTangent::Kept;
+                tangent_of = if keep { RoundTangent::Kept } else { RoundTangent::New };
                 last &= !far || round >= most;
             }
             if last {
@@ -813,7 +823,7 @@ impl Kernel {
     /// on that tangent. Linear elasticity has no need of it.
     ///
     /// Every second round keeps the tangent of the round before, and only its force is new.
-    fn linearize(&mut self, hands: &[Hand], tangent: ElasticTangent) {
+    fn linearize(&mut self, hands: &[Hand], tangent: RoundTangent) {
         let Some(elastic) = &mut self.elastic else { return };
         elastic.linearize(tangent);
         for (i, (solving, hand)) in self.solving.iter_mut().zip(hands).enumerate() {
@@ -824,7 +834,7 @@ impl Kernel {
                 let before = elastic.at_beginning(&hand.patch);
                 solving.speed = (solving.free - before) / self.h;
             }
-            if tangent != ElasticTangent::Kept {
+            if tangent != RoundTangent::Kept {
                 solving.compliance = turned(&self.creep, elastic.shapes(), hand, elastic.coordinates());
                 elastic.add_hand(&hand.patch);
                 for j in 0..=i {

@@ -22,7 +22,7 @@ pub(crate) type Six = SVector<f64, 6>;
 /// Derivative of a patch's position with respect to its six numbers.
 pub(crate) type Tangent = SMatrix<f64, 3, 6>;
 /// Response of one patch's six numbers to forces on the six numbers of another patch.
-type Block = SMatrix<f64, 6, 6>;
+type PairGram = SMatrix<f64, 6, 6>;
 
 /// Computes three dot products at once. They share the loads of `x` and do not wait for each other.
 fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
@@ -182,8 +182,8 @@ impl MeanRows {
     }
 
     /// Returns `B_self diag(weight) B_other^T`.
-    fn gram(&self, other: &Self, weight: &[f64], scratch: &mut Vec<f64>) -> Block {
-        let mut block = Block::zeros();
+    fn gram(&self, other: &Self, weight: &[f64], scratch: &mut Vec<f64>) -> PairGram {
+        let mut block = PairGram::zeros();
         for (i, mine) in self.0.iter().enumerate() {
             scratch.clear();
             scratch.extend(mine.iter().zip(weight).map(|(r, w)| r * w));
@@ -240,7 +240,7 @@ pub(crate) fn tangent(six: &Six, warped: bool) -> (Vector3<f64>, Tangent) {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Grams {
     patches: Vec<Arc<HeldPatch>>,
-    blocks: Vec<Block>,
+    blocks: Vec<PairGram>,
     scratch: Vec<f64>,
 }
 
@@ -281,7 +281,7 @@ impl Grams {
     }
 
     /// Returns the block of two hands. `j` must be at most `i`.
-    pub(crate) fn at(&self, i: usize, j: usize) -> &Block {
+    pub(crate) fn at(&self, i: usize, j: usize) -> &PairGram {
         &self.blocks[i * (i + 1) / 2 + j]
     }
 

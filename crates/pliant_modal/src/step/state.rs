@@ -17,7 +17,7 @@ pub struct State {
     pub a: Vec<f64>,
     /// Modal forces of the last step, kg^1/2 m/s^2. Generalized-alpha uses these in the next step.
     pub f: Vec<f64>,
-    /// Viscoelastic modal state (modal flow), kg^1/2 m: the displacement of the dashpot of each
+    /// Viscoelastic modal state, kg^1/2 m: the displacement of the dashpot of each
     /// mode's Maxwell branch. See [`Relaxation`](crate::Relaxation).
     pub z: Vec<f64>,
     /// Static coordinates of the own shapes of held patches, J^1/2 at the baked stiffness. Empty

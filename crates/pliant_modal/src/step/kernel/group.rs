@@ -14,7 +14,7 @@ use super::{
 use crate::{
     Probe, StepError,
     contact::{
-        Contact, ContactReport, ContactSites, Contacts, Memory, Point, Shape, Sixes, Touched, Touching,
+        Contact, ContactPoint, ContactReport, ContactSites, Contacts, Memory, Shape, Sixes, Touched, Touching,
     },
     step::{Frame, Hand, Load, State, StepReport},
 };
@@ -72,7 +72,7 @@ pub(crate) trait Member {
 impl<'a> View<'a> {
     /// Whether the frame moves.
     fn moves(&self) -> bool {
-        self.kernel.model.is_free() && !self.load.frame_is_given
+        self.kernel.model.is_free() && self.load.frame.is_none()
     }
 
     pub(super) fn sites(&self) -> Option<&'a ContactSites> {
@@ -323,7 +323,7 @@ impl<P: Member> Group<'_, P> {
                     sum += if at.first.is_some() { -force } else { force };
                 }
             }
-            self.probes[index].settle(&sum);
+            self.probes[index].respond(&sum);
         }
     }
 
@@ -550,7 +550,7 @@ impl<P: Member> Group<'_, P> {
     /// Stops the members that would pass through each other, because the laws could not be solved
     /// for a hard blow. Returns whether there are any.
     fn stop_torn(&mut self, work: &mut Touching) -> bool {
-        let torn = |point: &Point| {
+        let torn = |point: &ContactPoint| {
             point.far.as_ref().filter(|far| far.passed && point.violation() > TORN * self.size).is_some()
         };
         if !work.points.iter().any(torn) {
@@ -567,8 +567,9 @@ impl<P: Member> Group<'_, P> {
             }
         }
         self.stop(|member| marks[member] == 1, grounded);
-        let stopped =
-            |point: &Point| marks[point.member] == 1 || point.far.is_some_and(|far| marks[far.member] == 1);
+        let stopped = |point: &ContactPoint| {
+            marks[point.member] == 1 || point.far.is_some_and(|far| marks[far.member] == 1)
+        };
         work.points.retain(|point| !stopped(point));
         work.marks = marks;
         true
@@ -613,7 +614,7 @@ impl<P: Member> Group<'_, P> {
     }
 
     /// Keeps a contact with force for the next step, and lists it at both bodies.
-    fn keep(&mut self, point: &Point, force: &Vector3<f64>) {
+    fn keep(&mut self, point: &ContactPoint, force: &Vector3<f64>) {
         let held = point.pushed[1].hypot(point.pushed[2]);
         let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
         let normal = point.axes.row(0).transpose();

@@ -75,8 +75,9 @@ pub(super) fn look(obstacle: &dyn ObstacleShape, point: &Vector3<f64>) -> Result
     }
     let found = obstacle.at(point);
     let length = found.normal.norm();
-    let sound = !found.distance.is_nan() && (length - 1.0).abs() < 1e-6;
-    let got = if found.distance.is_nan() { found.distance } else { length };
+    let near = found.distance > f64::NEG_INFINITY;
+    let sound = near && (length - 1.0).abs() < 1e-6;
+    let got = if near { length } else { found.distance };
     StepError::check("obstacle", "a distance and a normal of length 1", sound, got)?;
     Ok(found)
 }

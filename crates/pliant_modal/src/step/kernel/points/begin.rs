@@ -9,7 +9,7 @@ use super::super::{
 use super::{DEEP, carried, far_compliance, far_side, find, friction, locate_at_body};
 use crate::{
     StepError,
-    contact::{Guess, Memory, ObstacleShape, Point, Shape, Site, Touched, Touching},
+    contact::{ContactPoint, Guess, Memory, ObstacleShape, Shape, Site, Touched, Touching},
 };
 
 /// Farthest distance of a site's surface from its anchor, as a share of the body's size. Beyond it
@@ -52,11 +52,11 @@ fn begin_at_obstacle(
     memory: &Memory,
     site: &Site,
     obstacle: &dyn ObstacleShape,
-) -> Result<Point, StepError> {
+) -> Result<ContactPoint, StepError> {
     let kernel = view.kernel;
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let located = kernel.locate(site, obstacle, frame, q)?;
-    let mut point = Point::new(member, memory.site, memory.other, view.contacts.friction());
+    let mut point = ContactPoint::new(member, memory.site, memory.other, view.contacts.friction());
     (point.first, point.last) = (memory.toward, located.toward);
     (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
     point.carried = carried(obstacle, &located.point, kernel.h)?;
@@ -74,14 +74,14 @@ fn begin_at_body(
     [own, shape]: [&Shape<'_>; 2],
     memory: &Memory,
     site: &Site,
-) -> Option<Point> {
+) -> Option<ContactPoint> {
     let (kernel, sites) = (view.kernel, far.sites()?);
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let size = kernel.model.size().min(far.kernel.model.size());
     let (located, near) =
         locate_at_body((own, memory.site, site), shape, DEEP * size, memory.place.as_ref(), Guess::None)
             .ok()?;
-    let mut point = Point::new(member, memory.site, memory.other, friction(view, far));
+    let mut point = ContactPoint::new(member, memory.site, memory.other, friction(view, far));
     (point.first, point.last) = (memory.toward, located.toward);
     (point.start, point.tangent) = own.site(memory.site, &memory.toward);
     let mut side = far_side(other, &near, shape);
@@ -102,7 +102,7 @@ fn begin_at_body(
 
 /// Gives a contact the force and the anchor of the step before.
 fn resume(
-    point: &mut Point,
+    point: &mut ContactPoint,
     memory: &Memory,
     normal: &Vector3<f64>,
     gap: f64,

@@ -10,7 +10,7 @@ use super::pass::{PARTS, march, pass};
 use super::{DEEP, carried, far_compliance, far_side, friction, locate_at_body, share};
 use crate::{
     StepError,
-    contact::{Clearance, ContactSites, Guess, Look, Point, Touched, Touching},
+    contact::{Clearance, ContactPoint, ContactSites, Guess, Look, Touched, Touching},
     step::Frame,
 };
 
@@ -131,7 +131,7 @@ fn travel(view: &View<'_>, sites: &ContactSites) -> [f64; 2] {
 }
 
 /// Site and bodies of a point.
-fn head(point: &Point) -> [usize; 3] {
+fn head(point: &ContactPoint) -> [usize; 3] {
     [point.site, point.member, point.far.map_or(usize::MAX, |far| far.member)]
 }
 
@@ -204,7 +204,7 @@ fn detect_at_obstacle(
             found = passed;
             hit = true;
         }
-        let mut point = Point::new(member, number, other, view.contacts.friction());
+        let mut point = ContactPoint::new(member, number, other, view.contacts.friction());
         (point.first, point.last, point.start) = (located.toward, located.toward, start);
         point.tangent = tangent;
         point.carried = carried(obstacle, &located.point, kernel.h)?;
@@ -360,7 +360,7 @@ fn detect_at_body<P: Member>(
             let shapes = [[own_start, own], [start, end]];
             let found = if passed { pass((number, site), shapes) } else { found };
             let Some((located, near)) = found else { continue };
-            let near_other = |point: &Point| {
+            let near_other = |point: &ContactPoint| {
                 point.member == other
                     && point.far.is_some_and(|far| far.member == member)
                     && (point.pushed[0] > 0.0 || point.off[0] <= near.distance.max(0.0) + SAME * deep)
@@ -372,7 +372,7 @@ fn detect_at_body<P: Member>(
             }
             let toward = if site.radius > 0.0 { located.toward } else { site.outward };
             let (begun, tangent) = own_start.site(number, &toward);
-            let mut point = Point::new(member, number, touched, friction(&view, &far));
+            let mut point = ContactPoint::new(member, number, touched, friction(&view, &far));
             (point.first, point.last) = (located.toward, located.toward);
             (point.start, point.tangent, point.place) = (begun, tangent, located.point);
             let mut side = far_side(other, &near, start);

@@ -9,7 +9,7 @@ use super::super::{
 use super::{RECOVERY_SPEED, begin::SNAPPED, carried, carrier_compliance, find, floor, pass::march, share};
 use crate::{
     ProbeContact, StepError,
-    contact::{AtProbe, Carriers, Grown, Near, Place, Point, ProbeMemory, Shape, Touched, Touching},
+    contact::{AtProbe, Carriers, ContactPoint, Grown, Near, Place, ProbeMemory, Shape, Touched, Touching},
     step::Tangent,
 };
 
@@ -50,7 +50,7 @@ pub(in super::super) fn begin_probes<P: Member>(
                 Touched::Obstacle(at) => {
                     let Some(obstacle) = probe.obstacles().get(at) else { continue };
                     let found = look(&**obstacle, &probe.start)?;
-                    let mut point = Point::new(span, at, memory.other, friction);
+                    let mut point = ContactPoint::new(span, at, memory.other, friction);
                     point.carried = carried(&**obstacle, &probe.start, group.h)?;
                     point.start = probe.start;
                     point.compliance = probe.rigid();
@@ -86,7 +86,13 @@ pub(in super::super) fn begin_probes<P: Member>(
 
 /// Gives a contact the force and the anchor of the step before. `from` is what leads from its start
 /// to where the anchor counts.
-fn resume(point: &mut Point, memory: &ProbeMemory, normal: &Vector3<f64>, from: Vector3<f64>, snaps: f64) {
+fn resume(
+    point: &mut ContactPoint,
+    memory: &ProbeMemory,
+    normal: &Vector3<f64>,
+    from: Vector3<f64>,
+    snaps: f64,
+) {
     point.before = memory.force;
     point.turn(normal);
     point.pushed = point.axes * memory.force;
@@ -110,9 +116,9 @@ fn at_body(
     place: &Place,
     probe: &crate::Probe,
     near: &Near,
-) -> Point {
+) -> ContactPoint {
     let friction = (view.contacts.friction() * probe.config().friction).sqrt();
-    let mut point = Point::new(member, 0, Touched::Probe(index), friction);
+    let mut point = ContactPoint::new(member, 0, Touched::Probe(index), friction);
     let carriers = shape.field.carriers(place);
     (point.start, point.tangent) = shape.material(place, &carriers);
     let first = Some((*place, carriers));
@@ -139,7 +145,7 @@ pub(in super::super) fn detect_probes<P: Member>(
         let (from, to) = (probe.start, probe.position);
         let way = to - from;
         for (at, obstacle) in probe.obstacles().iter().enumerate() {
-            let same = |point: &Point| point.member == span && point.other == Touched::Obstacle(at);
+            let same = |point: &ContactPoint| point.member == span && point.other == Touched::Obstacle(at);
             if work.points.iter().any(same) {
                 continue;
             }
@@ -150,7 +156,7 @@ pub(in super::super) fn detect_probes<P: Member>(
             if found.distance >= radius {
                 continue;
             }
-            let mut point = Point::new(span, at, Touched::Obstacle(at), probe.config().friction);
+            let mut point = ContactPoint::new(span, at, Touched::Obstacle(at), probe.config().friction);
             point.start = from;
             point.carried = carried(&**obstacle, &to, group.h)?;
             point.gap = look(&grown, &(from + point.carried))?.distance;
@@ -164,7 +170,7 @@ pub(in super::super) fn detect_probes<P: Member>(
             work.points.push(point);
         }
         for member in 0..group.len() {
-            let same = |point: &Point| {
+            let same = |point: &ContactPoint| {
                 point.member == member && point.probe.is_some_and(|probe| probe.probe == index)
             };
             if !probe.near.contains(&group.who[member]) || work.points.iter().any(same) {
@@ -198,7 +204,7 @@ pub(in super::super) fn detect_probes<P: Member>(
 /// Takes the gap of a point at a probe at the end of the computed step.
 pub(super) fn linearize_at_probe<P: Member>(
     group: &Group<'_, P>,
-    point: &mut Point,
+    point: &mut ContactPoint,
     recovers: bool,
 ) -> Result<(), StepError> {
     let Some(mut at) = point.probe else { return Ok(()) };
@@ -252,7 +258,7 @@ pub(super) fn linearize_at_probe<P: Member>(
 /// without force.
 pub(in super::super) fn keep_at_probe<P: Member>(
     group: &Group<'_, P>,
-    point: &Point,
+    point: &ContactPoint,
 ) -> Option<(usize, ProbeContact, Option<ProbeMemory>)> {
     let at = point.probe?;
     let pushes = point.pushed[0] > 0.0;
