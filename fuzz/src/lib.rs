@@ -9,13 +9,15 @@ use std::time::Duration;
 
 use pliant_haptics::Replay;
 use pliant_mesh::io;
-use pliant_modal::{BakeInfo, Damping, Element, GrabConfig, ModalModel, ModelParts, SurfaceMesh};
+use pliant_modal::{
+    BakeInfo, Damping, Element, FixedObstacle, FixedShape, GrabConfig, ModalModel, ModelParts, SurfaceMesh,
+};
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
 use pliant_stream::wire::{Datagram, GuestMessage, HostMessage, PeerMessage};
 use pliant_stream::{
     BodyId, Channel, GrabState, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
-    PeerId, RecoveryConfig, StepSettings, TickState, UserId,
+    PeerId, RecoveryConfig, RigidState, StepSettings, Surroundings, TickState, UserId,
 };
 
 /// All targets by name.
@@ -33,6 +35,7 @@ pub const TARGETS: [(&str, fn(&[u8])); 10] = [
 ];
 
 const BODY: BodyId = BodyId(1);
+const LOOSE: BodyId = BodyId(2);
 /// Formats of meshes and scenes, by their endings.
 pub const FORMATS: [&str; 10] = ["obj", "stl", "ply", "gltf", "glb", "msh", "vtk", "mesh", "veg", "ron"];
 
@@ -121,46 +124,61 @@ pub fn device(bytes: &[u8]) {
     }
 }
 
-/// A tetrahedron with two invented modes.
+/// A tetrahedron with two invented modes, held at a vertex.
 fn model() -> Arc<ModalModel> {
     static MODEL: OnceLock<Arc<ModalModel>> = OnceLock::new();
-    let made = || {
-        let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0_f32]];
-        let triangles = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3_u32]];
-        let surface =
-            SurfaceMesh::new(positions, triangles, None, vec![true, false, false, false]).expect("sound");
-        let omega = vec![10.0, 30.0];
-        let damping = Damping::Ratio(0.05);
-        let parts = ModelParts {
-            info: BakeInfo {
-                name: "fuzz".into(),
-                tets: 1,
-                nodes: 4,
-                element: Element::Tet4,
-                young: 1e5,
-                poisson: 0.3,
-                density: 1000.0,
-                damping,
-                anchors: vec!["x<0.01".into()],
-                residual_max: 0.0,
-                orthonormality_max: 0.0,
-            },
-            surface,
-            damping: omega.iter().map(|w| damping.coefficient(*w)).collect(),
-            participation: vec![[0.0; 3]; 2],
-            omega,
-            displacement: (0..24).map(|k| 0.1 * k as f32).collect(),
-            rotation: (0..24).map(|k| 0.05 * k as f32).collect(),
-            free: false,
-            mass: 1.0,
-            center_of_mass: [0.25; 3],
-            inertia: [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]],
-            sites: Vec::new(),
-            reduced: None,
-        };
-        Arc::new(ModalModel::from_parts(parts).expect("sound"))
+    MODEL.get_or_init(|| tetrahedron(false)).clone()
+}
+
+/// The same, free.
+fn loose() -> Arc<ModalModel> {
+    static MODEL: OnceLock<Arc<ModalModel>> = OnceLock::new();
+    MODEL.get_or_init(|| tetrahedron(true)).clone()
+}
+
+/// How the free body is stepped, and the floor under it.
+fn falls() -> (StepSettings, Surroundings) {
+    let ground = FixedObstacle { position: [0.0, -0.1, 0.0], ..FixedObstacle::GROUND };
+    let ball = FixedObstacle { shape: FixedShape::Ball { radius: 0.2 }, ..ground };
+    let around = Surroundings { obstacles: vec![ground, ball], ..Surroundings::default() };
+    (StepSettings { gravity: [0.0, -9.81, 0.0], ..StepSettings::default() }, around)
+}
+
+fn tetrahedron(free: bool) -> Arc<ModalModel> {
+    let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0_f32]];
+    let triangles = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3_u32]];
+    let surface =
+        SurfaceMesh::new(positions, triangles, None, vec![!free, false, false, false]).expect("sound");
+    let omega = vec![10.0, 30.0];
+    let damping = Damping::Ratio(0.05);
+    let parts = ModelParts {
+        info: BakeInfo {
+            name: "fuzz".into(),
+            tets: 1,
+            nodes: 4,
+            element: Element::Tet4,
+            young: 1e5,
+            poisson: 0.3,
+            density: 1000.0,
+            damping,
+            anchors: if free { Vec::new() } else { vec!["x<0.01".into()] },
+            residual_max: 0.0,
+            orthonormality_max: 0.0,
+        },
+        surface,
+        damping: omega.iter().map(|w| damping.coefficient(*w)).collect(),
+        participation: vec![[0.0; 3]; 2],
+        omega,
+        displacement: (0..24).map(|k| 0.1 * k as f32).collect(),
+        rotation: (0..24).map(|k| 0.05 * k as f32).collect(),
+        free,
+        mass: 1.0,
+        center_of_mass: [0.25; 3],
+        inertia: [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]],
+        sites: Vec::new(),
+        reduced: None,
     };
-    MODEL.get_or_init(made).clone()
+    Arc::new(ModalModel::from_parts(parts).expect("sound"))
 }
 
 fn recovery(byte: u8) -> RecoveryConfig {
@@ -199,12 +217,16 @@ impl Star {
     fn new(count: u64, first: u8) -> Self {
         let mut host = HostSession::new(HostSessionConfig::default()).expect("sound");
         host.add_body(BODY, "fuzz", model(), StepSettings::default()).expect("sound");
+        let (settings, around) = falls();
+        host.add_body(LOOSE, "loose", loose(), settings).expect("sound");
+        host.set_surroundings(LOOSE, around).expect("sound");
         let now = Duration::ZERO;
         let guest = |k: u64| {
             let recovery = recovery(first.wrapping_add(k as u8));
             let config = GuestSessionConfig { recovery, ..Default::default() };
             let mut guest = GuestSession::new(config, 1200).expect("sound");
             guest.add_cached_model(model());
+            guest.add_cached_model(loose());
             guest.connect(now).expect("sound");
             guest
         };
@@ -224,6 +246,10 @@ impl Star {
         let grabs = &self.held;
         let state = TickState { tick, q: &q, v: &v, a: &v, z: &[], pose: None, grabs, resting: false };
         self.host.publish(self.now, BODY, &state).expect("sound");
+        let position = [0.0, 0.1 * (0.2 * t).sin(), 0.0];
+        let pose = Some(RigidState { position, ..RigidState::default() });
+        let state = TickState { pose, grabs: &[], ..state };
+        self.host.publish(self.now, LOOSE, &state).expect("sound");
         for _ in 0..2 {
             self.exchange(lost);
         }
@@ -274,8 +300,8 @@ impl Star {
         for guest in &mut self.guests {
             while guest.poll_event().is_some() {}
             let user = guest.user();
+            assert!(guest.bodies().all(|view| view.visual().is_none_or(|shown| shown.is_finite())));
             let Some(view) = guest.body(BODY) else { continue };
-            assert!(view.visual().is_none_or(|shown| shown.is_finite()));
             for grab in 0..4 {
                 let told = user.and_then(|user| view.hand_reaction(user, grab));
                 assert!(told.is_none_or(|told| told.iter().all(|x| x.is_finite())));
@@ -355,6 +381,9 @@ pub fn mesh(bytes: &[u8]) {
             let config = PeerSessionConfig { user: UserId(k + 1), ..Default::default() };
             let mut peer = PeerSession::new(config).expect("sound");
             peer.add_body(BODY, model(), &StepSettings::default()).expect("sound");
+            let (settings, around) = falls();
+            peer.add_body(LOOSE, loose(), &settings).expect("sound");
+            peer.set_surroundings(LOOSE, around).expect("sound");
             for other in (0..3).filter(|other| *other != k) {
                 peer.connect(now, PeerId(u64::from(other)), UserId(other + 1), 1200).expect("room");
             }

@@ -93,6 +93,7 @@ pub mod session;
 #[cfg(test)]
 mod side_by_side;
 mod state;
+mod surroundings;
 pub mod wire;
 
 pub use error::StreamError;
@@ -105,6 +106,7 @@ pub use session::{
     HostSessionConfig, LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand, StreamedBody,
 };
 pub use state::{
-    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, RigidState, Role,
-    State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo, next_free,
+    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_IMPULSE_SPEED, MAX_MODES, PeerId, Placement,
+    RigidState, Role, State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo, next_free,
 };
+pub use surroundings::Surroundings;

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 use pliant_modal::{
-    GrabConfig, Hand, HeldPatch, HeldShapes, Hold, ImpliedPulls, Kernel, Load, ModalModel, Patch, State,
-    StepSettings,
+    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, ImpliedPulls, Kernel, Load, ModalModel,
+    ObstacleShape, Patch, State, StepSettings,
 };
 
-use crate::StreamError;
 use crate::prediction::{BodyCopy, HandState};
-use crate::state::{GrabKey, GrabState, RigidState};
+use crate::state::{GrabKey, GrabState, RigidState, capped_impulse};
 use crate::wire::FrameGrab;
+use crate::{StreamError, Surroundings};
 
 /// Largest number of cached patches. One more empties the table.
 const PATCHES: usize = 256;
@@ -28,6 +28,10 @@ pub(crate) struct Replica {
     hands: Vec<Hand>,
     keys: Vec<GrabKey>,
     implied: ImpliedPulls,
+    /// What the body may touch, and the contacts of the last step.
+    contacts: Contacts,
+    /// Memory for the state before an impulse.
+    spare: State,
     /// Number of patches made.
     pub(crate) made: u64,
 }
@@ -42,7 +46,60 @@ impl Replica {
     ) -> Result<Self, StreamError> {
         let kernel = Kernel::new(model, settings, modes, h).map_err(|e| StreamError::Model(e.to_string()))?;
         let implied = ImpliedPulls::new(&kernel);
-        Ok(Self { kernel, patches: Vec::new(), hands: Vec::new(), keys: Vec::new(), implied, made: 0 })
+        Ok(Self {
+            kernel,
+            patches: Vec::new(),
+            hands: Vec::new(),
+            keys: Vec::new(),
+            implied,
+            contacts: Contacts::default(),
+            spare: State::default(),
+            made: 0,
+        })
+    }
+
+    /// Lets copies of the body touch what stands around it.
+    ///
+    /// Only free bodies touch it, because the axes of an anchored body are not those of its world,
+    /// and only with all modes: fewer would need contact sites of their own. All copies of a body
+    /// in a session follow the same rule. For the others, contacts are a load that the host
+    /// corrects.
+    pub(crate) fn set_surroundings(&mut self, around: &Surroundings) -> Result<(), StreamError> {
+        let model = self.kernel.model();
+        let whole = model.is_free() && self.kernel.modes() == model.mode_count();
+        around.check()?;
+        let refused = |error: pliant_modal::StepError| StreamError::Model(error.to_string());
+        let obstacles = around.obstacles.iter().filter(|_| whole);
+        let obstacles = obstacles.map(|&obstacle| Arc::new(obstacle) as Arc<dyn ObstacleShape>);
+        self.contacts.set_friction(around.friction).map_err(refused)?;
+        self.contacts.set_obstacles(obstacles.collect()).map_err(refused)?;
+        if self.touches() {
+            self.kernel.prepare_contacts(&mut self.contacts).map_err(refused)
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Whether copies of the body may touch anything.
+    pub(crate) fn touches(&self) -> bool {
+        !self.contacts.obstacles().is_empty()
+    }
+
+    /// Sum of the contact forces of the last step (N), and their torque about `center` (N m), world
+    /// axes.
+    pub(crate) fn contact_push(&self, center: &Vector3<f64>) -> [Vector3<f64>; 2] {
+        let contacts = self.contacts.contacts().iter();
+        contacts.fold([Vector3::zeros(); 2], |[force, torque], contact| {
+            let (push, arm) = (Vector3::from(contact.force), Vector3::from(contact.point) - center);
+            [force + push, torque + arm.cross(&push)]
+        })
+    }
+
+    /// The frame at the end of a step of a copy, if it is known: that of `pose`. Without one the
+    /// frame of a body that touches nothing stays, and that of another is stepped.
+    pub(crate) fn end_frame(&self, copy: &BodyCopy, pose: Option<&RigidState>) -> Option<Frame> {
+        let known = pose.and_then(|pose| pose.frame(self.model()));
+        known.or((!self.touches()).then_some(copy.state.frame)).filter(|_| self.model().is_free())
     }
 
     pub(crate) fn kernel(&self) -> &Kernel {
@@ -119,12 +176,25 @@ impl Replica {
         self.hold(key, hand);
     }
 
+    /// Applies a user's impulse (N s, world axes) to a copy, within the limit of a session. One
+    /// that the body cannot take does nothing, alike on all machines.
+    pub(crate) fn apply_impulse(&mut self, copy: &mut BodyCopy, vertex: u32, impulse: [f64; 3]) {
+        let impulse = capped_impulse(self.kernel.model(), impulse);
+        self.kernel.apply_impulse(&mut copy.state, &mut self.spare, vertex, impulse).ok();
+    }
+
     /// Steps a copy with the hands that were added since [`Replica::release_all`]. A step whose
     /// result would not be finite leaves the state unchanged.
     pub(crate) fn step_held(&mut self, copy: &mut BodyCopy, load: &Load<'_>) {
         // The error is ignored on purpose. The sizes match by construction, and a receiver cannot
         // report a state that it cannot step. A checksum or a snapshot repairs the state.
-        self.kernel.step(&mut copy.state, &mut self.hands, load).ok();
+        if self.touches() {
+            self.contacts.recall(&copy.contacts);
+            self.kernel.step_touching(&mut copy.state, &mut self.hands, load, &mut self.contacts).ok();
+            self.contacts.remember(&mut copy.contacts);
+        } else {
+            self.kernel.step(&mut copy.state, &mut self.hands, load).ok();
+        }
         copy.hands.clear();
         copy.hands.extend(self.keys.iter().zip(&self.hands).map(|(&key, hand)| {
             let target = match hand.hold {
@@ -135,8 +205,20 @@ impl Replica {
         }));
     }
 
-    /// Steps a state with the streamed reactions and patch displacements. The rigid frame stays
-    /// where the state has it.
+    /// Adds a streamed hand on a body that moves on from what the stream knows: by a frame that is
+    /// stepped, or by the guest's own hands. The hand is held at its target by its own spring and
+    /// damper, not where the patch was. It has come there from its target in the tick before.
+    pub(crate) fn hold_streamed(&mut self, before: &BodyCopy, g: &FrameGrab, from: Option<&FrameGrab>) {
+        let h = self.kernel.h();
+        let Some(hand) = self.hold_measured(before, g) else { return };
+        let target = Vector3::from(g.state.target);
+        let way = from.map(|from| target - Vector3::from(from.state.target));
+        let velocity = way.map_or_else(Vector3::zeros, |way| way / h);
+        hand.hold = Hold::Target { target, velocity, config: g.state.hold };
+    }
+
+    /// Steps a state with the streamed reactions and patch displacements. A free body has `frame`
+    /// at the end.
     ///
     /// Reaction and displacement together say where the hand must have been, `place + C pull`, with
     /// `place` the position of the patch and `C` the hand's compliance. The step is then the body's
@@ -146,12 +228,21 @@ impl Replica {
     /// measured one when the state is right. Otherwise it draws the patches to their positions as
     /// the grab does, so errors decay as they would in the held body. A grab whose vertex the model
     /// lacks exerts no force.
-    pub(crate) fn step_measured(&mut self, copy: &mut BodyCopy, grabs: &[FrameGrab], load: &[f64]) {
+    ///
+    /// The same holds for contacts with what stands around the body: with the frame at both ends of
+    /// the step, they press the shape to where it must be.
+    pub(crate) fn step_measured(
+        &mut self,
+        copy: &mut BodyCopy,
+        grabs: &[FrameGrab],
+        load: &[f64],
+        frame: Option<Frame>,
+    ) {
         self.release_all();
         for g in grabs {
             self.hold_measured(copy, g);
         }
-        self.step_held(copy, &Load { modal: load, frame_is_given: true, ..Load::default() });
+        self.step_held(copy, &Load { modal: load, frame, ..Load::default() });
     }
 
     /// Extrapolation factor of the host, which keeps all modes, whatever this copy keeps.
@@ -190,9 +281,10 @@ impl Replica {
         to: [&[f64]; 2],
         grabs: &[FrameGrab],
         load: &[f64],
+        frame: Option<Frame>,
         out: &mut Vec<f64>,
     ) {
-        self.step_measured(from, grabs, load);
+        self.step_measured(from, grabs, load, frame);
         out.clear();
         out.resize(from.state.modes(), 0.0);
         self.kernel.missing_force(&from.state, to, out);

@@ -1,4 +1,5 @@
-//! Compares a body with a receiver's copy of it: the same inputs must give the same states.
+//! Compares a body with a receiver's copy and with a peer's body: the same inputs must give the
+//! same states.
 
 use std::{path::Path, sync::Arc};
 
@@ -7,10 +8,11 @@ use pliant_modal::{
     Body, BodyConfig, GrabConfig, Integrator, Load, ModalModel, Patch, Relaxation, StepSettings,
 };
 
+use crate::peer::{InputLog, LateInputRepair, PeerBody};
 use crate::prediction::BodyCopy;
 use crate::replica::Replica;
-use crate::state::{GrabKey, GrabState, UserId};
-use crate::wire::FrameGrab;
+use crate::state::{BodyId, GrabKey, GrabState, State, UserId};
+use crate::wire::{FrameGrab, HeldAt, InputTick};
 
 /// Largest allowed difference, as a share of the largest value of the same kind in the run.
 const SAME: f64 = 1e-12;
@@ -40,7 +42,18 @@ fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> SideBySide {
     SideBySide { vertex, radius, config: GrabConfig::default(), way }
 }
 
-/// Steps the body and its copy `steps` times and compares states and reactions after each step.
+/// Largest differences of displacements, velocities, reactions and centers between two bodies.
+type Off = [f64; 4];
+
+fn off(body: &Body, state: &State, reactions: impl Iterator<Item = ([f64; 3], Vector3<f64>)>) -> Off {
+    let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).fold(0.0, |m: f64, (a, b)| m.max((a - b).abs()));
+    let center = Vector3::from(body.frame().center()) - Vector3::from(state.frame.center());
+    let reaction = reactions.fold(0.0, |m: f64, (a, b)| m.max((Vector3::from(a) - b).norm()));
+    [apart(body.q(), &state.q), apart(body.v(), &state.v), reaction, center.norm()]
+}
+
+/// Steps the body, a receiver's copy and a peer's body `steps` times and compares states and
+/// reactions after each step.
 fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[SideBySide], steps: usize) {
     let h = config.step;
     let settings = config.settings;
@@ -56,8 +69,12 @@ fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Sid
     let mut copy = Replica::new(model.clone(), settings, model.mode_count(), h).unwrap();
     let mut stepped = BodyCopy::new(copy.kernel().at_rest());
     let key = |number: usize| GrabKey { user: UserId(1), grab: number as u16 };
+    let (user, number) = (UserId(1), BodyId(1));
+    let mut peer = PeerBody::new(number, model.clone(), &settings, h, LateInputRepair::Rollback, 0).unwrap();
+    let mut inputs = InputLog::default();
+    inputs.expect(user, 1);
     let mut largest = [0.0f64; 3];
-    let mut off = Vec::new();
+    let mut differences = Vec::new();
     for step in 0..steps {
         let share = (step as f64 * h / 0.5).min(1.0);
         let share = share * share * (3.0 - 2.0 * share);
@@ -72,30 +89,39 @@ fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Sid
             copy.hold_at(&stepped, key(i), (case.vertex, case.radius), targets[i], case.config);
         }
         copy.step_held(&mut stepped, &Load::default());
-        let state = &stepped.state;
+        let held = cases.iter().zip(&targets).enumerate().map(|(i, (case, target))| HeldAt {
+            body: number,
+            grab: i as u16,
+            vertex: case.vertex,
+            radius: case.radius,
+            target: (*target).into(),
+            hold: case.config,
+        });
+        inputs.put(user, InputTick { tick: step as u64 + 1, held: held.collect(), ..Default::default() });
+        peer.advance(&inputs);
 
-        let mut off_now = [0.0f64; 3];
-        for (kind, (true_, copied)) in [(body.q(), &state.q), (body.v(), &state.v)].into_iter().enumerate() {
-            for (a, b) in true_.iter().zip(copied) {
-                largest[kind] = largest[kind].max(a.abs());
-                off_now[kind] = off_now[kind].max((a - b).abs());
-            }
+        for (kind, values) in [body.q(), body.v()].into_iter().enumerate() {
+            largest[kind] = values.iter().fold(largest[kind], |m, x| m.max(x.abs()));
         }
-        for (i, (id, _)) in grabs.iter().enumerate() {
-            let hand = stepped.hand(key(i)).unwrap();
-            let reaction = Vector3::from(body.reaction(*id).unwrap());
-            largest[2] = largest[2].max(reaction.norm());
-            off_now[2] = off_now[2].max((reaction + hand.pull).norm());
+        let reactions: Vec<[f64; 3]> = grabs.iter().map(|(id, _)| body.reaction(*id).unwrap()).collect();
+        for reaction in &reactions {
+            largest[2] = largest[2].max(Vector3::from(*reaction).norm());
         }
-        let center = Vector3::from(body.frame().center()) - Vector3::from(state.frame.center());
-        off.push([off_now[0], off_now[1], off_now[2], center.norm()]);
+        let pulls = (0..cases.len()).map(|i| -stepped.hand(key(i)).unwrap().pull);
+        let copied = off(&body, &stepped.state, reactions.iter().copied().zip(pulls));
+        let shown = peer.grabs().iter().map(|grab| Vector3::from(grab.reaction));
+        assert_eq!(peer.grabs().len(), cases.len(), "{name}, step {step}");
+        let peers = off(&body, peer.live(), reactions.iter().copied().zip(shown));
+        differences.push([("a copy", copied), ("a peer", peers)]);
     }
     let scale = [largest[0], largest[1], largest[2], model.size()];
-    for (step, off) in off.iter().enumerate() {
+    for (step, (who, off)) in
+        differences.iter().enumerate().flat_map(|(step, both)| both.iter().map(move |one| (step, one)))
+    {
         let [q, v, reaction, apart] = [0, 1, 2, 3].map(|kind| off[kind] / scale[kind]);
         assert!(
             [q, v, reaction, apart].iter().all(|off| *off <= SAME),
-            "{name}, step {step}: q is off by {q:.1e} of its largest, v by {v:.1e}, the reaction by \
+            "{name}, {who}, step {step}: q is off by {q:.1e} of its largest, v by {v:.1e}, the reaction by \
              {reaction:.1e}; the frames are {apart:.1e} sizes apart"
         );
     }
@@ -206,7 +232,8 @@ fn observed(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide
                 held: true,
             })
             .collect();
-        copy.step_measured(&mut stepped, &frame, &vec![0.0; model.mode_count()]);
+        let end = copy.end_frame(&stepped, None);
+        copy.step_measured(&mut stepped, &frame, &vec![0.0; model.mode_count()], end);
         for (a, b) in body.q().iter().zip(&stepped.state.q) {
             (largest, off) = (largest.max(a.abs()), off.max((a - b).abs()));
         }

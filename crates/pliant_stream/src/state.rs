@@ -7,6 +7,8 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 pub use pliant_modal::State;
 use pliant_modal::{Body, Frame, GrabConfig, ModalModel};
 
+use crate::wire::round24;
+
 /// Number of a step of the host. Ticks ascend by one per step of `h` seconds.
 pub type Tick = u64;
 
@@ -22,6 +24,17 @@ pub const MAX_MODES: usize = 4096;
 /// Largest magnitude of positions and displacements (m), reactions (N) and speeds. Larger values
 /// are refused as corrupt.
 pub const MAGNITUDE_LIMIT: f64 = 1e9;
+
+/// Largest change of speed that an impulse over a network brings to a whole body, m/s.
+pub const MAX_IMPULSE_SPEED: f64 = 100.0;
+
+/// Limits an impulse (N s) of a user to what changes the speed of the whole body by at most
+/// [`MAX_IMPULSE_SPEED`]. Hosts and peers apply the same limit, and so do senders.
+pub fn capped_impulse(model: &ModalModel, impulse: [f64; 3]) -> [f64; 3] {
+    let impulse = Vector3::from(impulse);
+    let (most, size) = (model.mass() * MAX_IMPULSE_SPEED, impulse.norm());
+    if size > most { (impulse * (most / size)).into() } else { impulse.into() }
+}
 
 /// Identifies a connection of the transport. The caller chooses the number, and the session returns
 /// it unchanged.
@@ -172,7 +185,7 @@ impl fmt::Display for BodyId {
 }
 
 /// The rigid frame of a free body: pose and twist, in world axes.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct RigidState {
     /// Origin of the body's frame, m.
     pub position: [f64; 3],
@@ -221,6 +234,16 @@ impl RigidState {
         let inertia = model.inertia();
         let spin = turn * (Matrix3::from_fn(|i, j| inertia[i][j]) * (turn.inverse() * angular));
         Frame::from_motion(model, center.into(), self.rotation, velocity.into(), spin.into()).ok()
+    }
+
+    /// The pose as a frame on the wire has it.
+    pub(crate) fn rounded(self) -> Self {
+        Self {
+            position: self.position.map(|x| f64::from(x as f32)),
+            rotation: self.rotation.map(|x| f64::from(x as f32)),
+            linear: self.linear.map(round24),
+            angular: self.angular.map(round24),
+        }
     }
 
     pub(crate) fn turn(&self) -> Option<UnitQuaternion<f64>> {
@@ -296,7 +319,7 @@ pub struct TickState<'a> {
     pub pose: Option<RigidState>,
     /// All grabs of the body, at most [`MAX_GRABS`].
     pub grabs: &'a [GrabState],
-    /// The body sleeps. The session sends nothing but a slow reminder until this is false again.
+    /// The body sleeps. The session sends nothing of it until this is false again.
     pub resting: bool,
 }
 

@@ -7,18 +7,21 @@ mod support;
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use pliant_modal::{GrabConfig, ModalModel, Relaxation};
+use pliant_modal::{
+    ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig, ModalModel, Relaxation,
+};
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
-    HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerHandState, PeerMessage,
-    ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets,
-    TickFrame,
+    HostMessage, ImpulseAt, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerHandState,
+    PeerMessage, ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes, StateCheck,
+    TargetEntry, Targets, TickFrame,
 };
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
-    HostSessionConfig, Newmark, PeerId, RecoveryConfig, RigidState, StepSettings, StreamError, TickState,
+    HostSessionConfig, Newmark, PeerId, RecoveryConfig, RigidState, StepSettings, StreamError, Surroundings,
+    TickState,
 };
 use proptest::prelude::*;
 use support::bar;
@@ -207,6 +210,30 @@ fn sessions_survive_a_hundred_thousand_damaged_datagrams() {
     }
 }
 
+/// What a contact has left.
+fn contacts() -> ContactState {
+    let memory = |site| ContactMemory {
+        obstacle: 0,
+        site,
+        force: [0.0, 2.0, 0.5],
+        anchor: [0.5; 3],
+        toward: [0.0; 3],
+    };
+    ContactState { weight: 0.75, lost: 0.5, memory: vec![memory(3), memory(9)] }
+}
+
+/// An obstacle of every shape.
+fn around() -> Surroundings {
+    let shapes = [
+        FixedShape::Plane,
+        FixedShape::Ball { radius: 0.5 },
+        FixedShape::Box { half: [1.0, 2.0, 3.0], round: 0.25 },
+        FixedShape::Capsule { radius: 0.5, half_length: 1.0 },
+    ];
+    let of = |shape| FixedObstacle { shape, position: [0.0, -1.0, 0.0], ..FixedObstacle::GROUND };
+    Surroundings { friction: 0.25, obstacles: shapes.map(of).to_vec() }
+}
+
 /// Valid bytes of every kind of external input.
 fn real_inputs() -> Vec<Vec<u8>> {
     let mut all: Vec<Vec<u8>> = samples().iter().map(|d| d.encode(3)).collect();
@@ -219,6 +246,8 @@ fn real_inputs() -> Vec<Vec<u8>> {
         z: vec![0.25; 9],
         load: Vec::new(),
         means: vec![(1, 2, [0.5, -3.0, 1.0])],
+        contacts: contacts(),
+        pose: Some(RigidState { position: [1.0, 2.0, 3.0], ..RigidState::default() }),
         resting: false,
     };
     let info = BodyInfo {
@@ -231,6 +260,7 @@ fn real_inputs() -> Vec<Vec<u8>> {
             relaxation: Some(Relaxation { ratio: 0.5, time: 0.4 }),
             ..Default::default()
         },
+        around: around(),
     };
     all.push(HostMessage::Snapshot(snapshot).encode());
     all.push(HostMessage::BodyAdded(info).encode());
@@ -246,6 +276,7 @@ fn real_inputs() -> Vec<Vec<u8>> {
         }
         .encode(),
     );
+    all.push(GuestMessage::Impulse { body: 1, vertex: 8, impulse: [0.5, 0.0, -2.0] }.encode());
     let held = vec![HeldAt {
         body: BODY,
         grab: 3,
@@ -254,7 +285,8 @@ fn real_inputs() -> Vec<Vec<u8>> {
         target: [1.0, -2.0, 0.5],
         hold: GrabConfig { stiffness: Some(400.0), relaxation: 0.01 }.capped(),
     }];
-    let ticks = vec![InputTick { tick: 9, held }, InputTick { tick: 8, held: Vec::new() }];
+    let impulses = vec![ImpulseAt { body: BODY, vertex: 8, impulse: [0.5, 0.0, -2.0] }];
+    let ticks = vec![InputTick { tick: 9, held, impulses }, InputTick { tick: 8, ..Default::default() }];
     let check = Some(StateCheck { body: BODY, tick: 8, value: 0.5 });
     all.push(Datagram::Inputs(Inputs { now: 9, ahead: Some(0.5), ticks, check }).encode(1));
     all.push(Datagram::InputRequest(vec![NackRun { first: 5, count: 3 }]).encode(2));
@@ -276,6 +308,7 @@ fn real_inputs() -> Vec<Vec<u8>> {
             target: [1.0; 3],
             viscoelastic: [0.0; 3],
         }],
+        contacts: contacts(),
     };
     let hello = PeerMessage::Hello {
         version: 4,
@@ -287,10 +320,100 @@ fn real_inputs() -> Vec<Vec<u8>> {
     };
     all.push(hello.encode());
     all.push(PeerMessage::Welcome { user: 2, others: vec![(3, "elsewhere".into())] }.encode());
-    all.push(PeerMessage::State { tick: 7, now: 9, bodies: vec![body] }.encode());
+    all.push(PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![body] }.encode());
     all.push(b"12.5\nlost # a comment\n13\n".to_vec());
     all.push(bar(2, 0.05).to_bytes());
     all
+}
+
+#[test]
+fn obstacles_and_contacts_that_are_none_are_refused() {
+    let settings = StepSettings::default();
+    let added = |around: Surroundings| {
+        let info = BodyInfo { body: 1, name: "jack".into(), hash: [7; 32], modes: 9, settings, around };
+        HostMessage::decode(&HostMessage::BodyAdded(info).encode())
+    };
+    added(around()).unwrap();
+    let ball = |radius| FixedObstacle { shape: FixedShape::Ball { radius }, ..FixedObstacle::GROUND };
+    let many = |count| Surroundings { obstacles: vec![ball(1.0); count], ..around() };
+    added(many(256)).unwrap();
+    let turned = FixedObstacle { rotation: [0.0, 0.0, 0.0, 2.0], ..ball(1.0) };
+    let away = FixedObstacle { position: [0.0, f64::INFINITY, 0.0], ..ball(1.0) };
+    for bad in [ball(f64::NAN), ball(-1.0), ball(1e9), turned, away] {
+        assert!(added(Surroundings { obstacles: vec![bad], ..around() }).is_err(), "{bad:?}");
+    }
+    assert!(added(many(257)).is_err());
+    assert!(added(Surroundings { friction: f64::NAN, ..around() }).is_err());
+
+    let memory = contacts().memory[0];
+    let state = |contacts: ContactState| {
+        let zero = || vec![0.0; 4];
+        let (q, v, a, z, force) = (zero(), zero(), zero(), Vec::new(), zero());
+        let body = PeerBodyState { body: 1, q, v, a, z, force, frame: None, pulls: Vec::new(), contacts };
+        PeerMessage::decode(&PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![body] }.encode())
+    };
+    state(contacts()).unwrap();
+    let places = |count| (0..count).map(|site| ContactMemory { site, ..memory }).collect();
+    state(ContactState { memory: places(1024), ..contacts() }).unwrap();
+    for bad in [
+        ContactState { memory: places(1025), ..contacts() },
+        ContactState { memory: vec![memory; 2], ..contacts() },
+        ContactState { memory: vec![ContactMemory { force: [f64::NAN; 3], ..memory }], ..contacts() },
+        ContactState { memory: vec![ContactMemory { toward: [2.0, 0.0, 0.0], ..memory }], ..contacts() },
+        ContactState { weight: 2.0, ..contacts() },
+        ContactState { lost: -1.0, ..contacts() },
+    ] {
+        assert!(state(bad.clone()).is_err(), "{bad:?}");
+    }
+}
+
+/// A datagram of a peer with `held` hands and `impulses` at one tick, which says that it has one
+/// more of either, and has the bytes for it.
+fn one_too_many(held: usize, impulses: usize) -> [Vec<u8>; 3] {
+    let hand = |grab| HeldAt {
+        body: BODY,
+        grab,
+        vertex: 9,
+        radius: 0.25,
+        target: [1.0, -2.0, 0.5],
+        hold: GrabConfig::default(),
+    };
+    let held: Vec<HeldAt> = (0..held as u16).map(hand).collect();
+    let impulses = vec![ImpulseAt { body: BODY, vertex: 8, impulse: [0.5, 0.0, -2.0] }; impulses];
+    let (hands, blows) = (25 * held.len(), 18 * impulses.len());
+    let ticks = vec![InputTick { tick: 9, held, impulses }];
+    let right = Datagram::Inputs(Inputs { now: 9, ahead: None, ticks, check: None }).encode(1);
+    // The last byte tells that no checksum follows. Before it are the impulses with their number,
+    // and before these the hands with theirs.
+    let blows_at = right.len() - 1 - blows;
+    let hands_at = blows_at - 1 - hands;
+    let more = |at: usize, bytes: usize| {
+        let mut wrong = right.clone();
+        wrong[at - 1] += 1;
+        let copy = wrong[at..at + bytes].to_vec();
+        wrong.splice(at..at, copy);
+        wrong
+    };
+    [more(hands_at, 25), more(blows_at, 18), right]
+}
+
+#[test]
+fn no_peer_has_more_than_sixteen_hands_and_eight_impulses_at_a_tick() {
+    let read = |bytes: &[u8]| match Datagram::decode(bytes) {
+        Ok((_, Datagram::Inputs(inputs))) => Ok((inputs.ticks[0].held.len(), inputs.ticks[0].impulses.len())),
+        Ok(other) => panic!("{other:?}"),
+        Err(error) => Err(error),
+    };
+    let [hand, blow, right] = one_too_many(15, 7);
+    assert_eq!([&right, &hand, &blow].map(|bytes| read(bytes)), [Ok((15, 7)), Ok((16, 7)), Ok((15, 8))]);
+    let [hand, blow, right] = one_too_many(16, 8);
+    assert_eq!(read(&right), Ok((16, 8)));
+    let refused = |bytes: &[u8], name: &str| match read(bytes) {
+        Err(StreamError::Invalid { what, .. }) => assert_eq!(what, name),
+        other => panic!("{name}: {other:?}"),
+    };
+    refused(&hand, "held count");
+    refused(&blow, "impulse count");
 }
 
 /// Runs every parser of external bytes and returns how many could read `bytes`. A value that was

@@ -1,19 +1,21 @@
 //! A guest that sends as much as it can costs the host a bounded amount of work, and bars nobody.
-//! The work is counted, since times depend on the machine.
+//! The work is counted, since times depend on the machine. The last test measures times, and is run
+//! by hand.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
 
-use std::time::Duration;
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{Duration, Instant};
 
-use pliant_modal::Patch;
+use pliant_modal::{Body, BodyConfig, GrabId, Patch};
 use pliant_stream::wire::{
     Datagram, GuestMessage, Nack, NackRun, PROTOCOL_VERSION, Payload, StreamSubscription, TargetEntry,
     Targets,
 };
 use pliant_stream::{
-    BodyId, DisconnectReason, HostEvent, HostSession, HostSessionConfig, PeerId, StepSettings, StreamError,
-    TickState,
+    BodyId, DisconnectReason, GrabKey, GrabState, HandPlayout, HostEvent, HostSession, HostSessionConfig,
+    PeerId, StepSettings, StreamError, TickState,
 };
 use support::fine_bar;
 
@@ -111,6 +113,41 @@ fn sixty_four_targets_in_each_datagram_move_a_hand_no_more_often_than_a_hand_mov
 }
 
 #[test]
+fn a_guest_strikes_no_more_often_than_its_budget_and_stays_in() {
+    let (mut host, now) = (host(), Duration::ZERO);
+    while host.poll_event().is_some() {}
+    let struck = |host: &mut HostSession| {
+        std::iter::from_fn(|| host.poll_event()).filter(|e| matches!(e, HostEvent::Impulse { .. })).count()
+    };
+    let strike = |vertex, impulse| GuestMessage::Impulse { body: BODY.0, vertex, impulse }.encode();
+    // A vertex that is not there and a body that is not there pay, too.
+    host.on_message(now, PeerId(1), &strike(1_000_000, [1.0; 3]));
+    host.on_message(
+        now,
+        PeerId(1),
+        &GuestMessage::Impulse { body: 99, vertex: 0, impulse: [1.0; 3] }.encode(),
+    );
+    for _ in 0..1000 {
+        host.on_message(now, PeerId(1), &strike(0, [0.0, 1e9, 0.0]));
+    }
+    let events: Vec<HostEvent> = std::iter::from_fn(|| host.poll_event()).collect();
+    assert_eq!(events.len(), 118, "120 at once");
+    let HostEvent::Impulse { impulse, .. } = events[0] else { panic!("{:?}", events[0]) };
+    // The bar has 2 kg, and no impulse brings it more than 100 m/s.
+    assert!((impulse[1] - 200.0).abs() < 1e-9, "{impulse:?}");
+    for second in 1..=10 {
+        for _ in 0..500 {
+            host.on_message(Duration::from_secs(second), PeerId(1), &strike(0, [0.1; 3]));
+        }
+        assert_eq!(struck(&mut host), 60, "second {second}");
+    }
+    assert!(host.stats(PeerId(1)).is_some(), "the guest is still there");
+    // What is no number is a breach.
+    host.on_message(Duration::from_secs(11), PeerId(1), &strike(0, [f64::NAN; 3]));
+    assert!(host.stats(PeerId(1)).is_none());
+}
+
+#[test]
 fn patches_are_charged_by_their_entries() {
     // Whole-body patches, sixty each second. Each is another one, so that no table has it.
     let (mut host, model) = (host(), fine_bar(CELLS, 12));
@@ -184,4 +221,174 @@ fn silent_connections_bar_nobody_and_who_is_present_stays() {
     // Nobody who is in the session makes room.
     let full = host.connect(now, PeerId(9999), 1200);
     assert_eq!(full, Err(StreamError::Full { what: "guests", limit: most as usize }));
+}
+
+/// Cells of the body that is measured, which has four times as many vertices.
+const MEASURED: usize = 2500;
+/// What a frame of `pliant_net` reads of one peer: an event counts two, and one for every 16 bytes.
+const READ_OF_A_PEER: usize = 512;
+
+/// What a stranger sends in the frame `k`, and what of it is a datagram.
+type Flood = fn(u32) -> Vec<(bool, Vec<u8>)>;
+
+/// Datagrams of 64 targets, as many as the transport keeps.
+fn flood_of_targets(k: u32) -> Vec<(bool, Vec<u8>)> {
+    let datagram = |n: u32| {
+        let entry = |t: u32| {
+            let input = (k * QUEUED + n) * 64 + t;
+            TargetEntry { grab: 0, input, target: [1.0, 0.001 * f64::from(input % 9), 0.0] }
+        };
+        (true, Datagram::Targets(Targets { entries: (0..64).map(entry).collect() }).encode(n as u16))
+    };
+    (0..QUEUED).map(datagram).collect()
+}
+
+/// Changes of interest, 20,000 a second.
+fn flood_of_messages(k: u32) -> Vec<(bool, Vec<u8>)> {
+    let message = |n: u32| {
+        let interest = GuestMessage::Interest { body: BODY.0, modes: Some(1 + ((k + n) % 12) as u16) };
+        let bytes = interest.encode();
+        assert!(bytes.len() <= 5);
+        (false, bytes)
+    };
+    (0..20_000 / FRAMES).map(message).collect()
+}
+
+/// A grab of the whole body in each frame, and the end of the one before.
+fn flood_of_grabs(k: u32) -> Vec<(bool, Vec<u8>)> {
+    let end = GuestMessage::GrabEnd { grab: k as u16 - 1 }.encode();
+    vec![(false, end), (false, begin(k as u16, k, 1.01 + 1e-5 * f64::from(k)))]
+}
+
+/// A host's app without an engine: it holds, steps and publishes one body.
+struct App {
+    host: HostSession,
+    body: Body,
+    held: BTreeMap<GrabKey, (GrabId, GrabState, HandPlayout)>,
+}
+
+impl App {
+    fn new() -> Self {
+        let model = fine_bar(MEASURED, 12);
+        let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
+        host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
+        let config = BodyConfig { step: 1.0 / f64::from(FRAMES), ..BodyConfig::default() };
+        Self { host, body: Body::new(model, config).unwrap(), held: BTreeMap::new() }
+    }
+
+    fn join(&mut self, peer: PeerId) {
+        self.host.connect(Duration::ZERO, peer, 1200).unwrap();
+        let cached = vec![self.body.model().hash().0];
+        let subscription =
+            StreamSubscription { payload: Payload::Forces, modes: 12, repeats: 4, refresh: 60 };
+        let name = "guest".into();
+        let hello = GuestMessage::Hello { version: PROTOCOL_VERSION, name, subscription, cached };
+        self.host.on_message(Duration::ZERO, peer, &hello.encode());
+    }
+
+    fn take(&mut self, event: HostEvent) {
+        match event {
+            HostEvent::GrabBegan { key, vertex, radius, target, hold, .. } => {
+                let patch = Patch::around(self.body.model().surface(), vertex, radius);
+                match patch.ok().and_then(|patch| self.body.grab(&patch, hold).ok()) {
+                    Some(id) => {
+                        let state = GrabState { key, vertex, radius, target, reaction: [0.0; 3], hold };
+                        self.held.insert(key, (id, state, HandPlayout::new(target.into())));
+                    }
+                    None => self.host.refuse_grab(key),
+                }
+            }
+            HostEvent::GrabMoved { key, input, target, .. } => {
+                if let Some((.., hand)) = self.held.get_mut(&key) {
+                    hand.take(input, 1, target.into());
+                }
+            }
+            HostEvent::GrabEnded { key, .. } => {
+                if let Some((id, ..)) = self.held.remove(&key) {
+                    self.body.release(id);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// One frame: reads what waits, steps, publishes and sends.
+    fn frame(&mut self, now: Duration, tick: u64, inboxes: &mut [(PeerId, VecDeque<(bool, Vec<u8>)>)]) {
+        for (peer, waiting) in inboxes {
+            let mut left = READ_OF_A_PEER;
+            while let (1.., Some((is_datagram, bytes))) = (left, waiting.pop_front()) {
+                left = left.saturating_sub(2 + bytes.len() / 16);
+                if is_datagram {
+                    self.host.on_datagram(now, *peer, &bytes);
+                } else {
+                    self.host.on_message(now, *peer, &bytes);
+                }
+            }
+        }
+        while let Some(event) = self.host.poll_event() {
+            self.take(event);
+        }
+        for (id, _, hand) in self.held.values_mut() {
+            self.body.set_target(*id, hand.next(2, 20.0 / f64::from(FRAMES)).into()).unwrap();
+        }
+        self.body.step().unwrap();
+        let mut grabs = Vec::new();
+        for (id, state, _) in self.held.values_mut() {
+            state.target = self.body.target(*id).unwrap();
+            state.reaction = self.body.reaction(*id).unwrap();
+            grabs.push(*state);
+        }
+        let (q, v, a) = (self.body.q(), self.body.v(), self.body.a());
+        let state = TickState { tick, q, v, a, z: &[], pose: None, grabs: &grabs, resting: false };
+        self.host.publish(now, BODY, &state).unwrap();
+        self.host.update(now);
+        while self.host.poll_output().is_some() {}
+    }
+}
+
+/// Run by hand, on a quiet machine and with `--release`.
+#[test]
+#[ignore = "measures times"]
+fn times_of_the_frames_of_a_session_that_is_flooded() {
+    let none: &[Flood] = &[];
+    let of: [(&str, &[Flood]); 5] = [
+        ("nobody floods", none),
+        ("datagrams of 64 targets", &[flood_of_targets]),
+        ("messages of five bytes", &[flood_of_messages]),
+        ("60 grabs of the whole body a second", &[flood_of_grabs]),
+        ("all three", &[flood_of_targets, flood_of_messages, flood_of_grabs]),
+    ];
+    for (what, floods) in of {
+        let mut app = App::new();
+        app.join(PeerId(1));
+        app.host.on_message(Duration::ZERO, PeerId(1), &begin(0, 66, 0.05));
+        let mut inboxes = vec![(PeerId(1), VecDeque::new())];
+        for k in 0..floods.len() as u64 {
+            app.join(PeerId(2 + k));
+            app.host.on_message(Duration::ZERO, PeerId(2 + k), &begin(0, 66, 0.05));
+            inboxes.push((PeerId(2 + k), VecDeque::new()));
+        }
+        let mut frames = Vec::new();
+        for k in 1..=10 * FRAMES {
+            // The guest moves its hand, and each stranger sends more than a frame reads.
+            let target = [1.0, 0.2 * (0.05 * f64::from(k)).sin(), 0.1];
+            let entries = vec![TargetEntry { grab: 0, input: k, target }];
+            inboxes[0].1.push_back((true, Datagram::Targets(Targets { entries }).encode(k as u16)));
+            for (flood, (_, waiting)) in floods.iter().zip(&mut inboxes[1..]) {
+                // The transport drops datagrams that find no room, and holds messages back.
+                waiting.truncate(1024);
+                waiting.retain(|(is_datagram, _)| !is_datagram);
+                waiting.extend(flood(k));
+            }
+            let began = Instant::now();
+            app.frame(k * Duration::from_secs(1) / FRAMES, k.into(), &mut inboxes);
+            frames.push(began.elapsed());
+        }
+        assert_eq!(app.host.users().count(), 1 + floods.len(), "{what}: all are still in");
+        assert!(app.held.keys().any(|key| key.user.0 == 1), "{what}: the guest holds on");
+        frames.sort();
+        let [median, p99, longest] = [300, 594, 599].map(|at| frames[at]);
+        println!("{what}: median {median:.1?}, p99 {p99:.1?}, longest {longest:.1?}");
+        assert!(p99 < Duration::from_millis(5), "{what}");
+    }
 }

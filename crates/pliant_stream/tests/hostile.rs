@@ -10,7 +10,7 @@ use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig};
 use pliant_stream::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, NackRun, PROTOCOL_VERSION};
 use pliant_stream::{
     Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostSession, Newmark, PeerId,
-    StepSettings, StreamError,
+    StepSettings, StreamError, Surroundings,
 };
 use support::bar;
 use support::direct::{BODY, pass, peers, publish, random, session};
@@ -27,6 +27,7 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
         hash,
         modes: 9,
         settings: StepSettings::default(),
+        around: Surroundings::default(),
     };
     let chunk = |hash, total, bytes: &[u8]| {
         HostMessage::ModelChunk { hash, offset: 0, total, bytes: bytes.to_vec() }.encode()

@@ -287,7 +287,7 @@ fn all_guests_know_who_is_there_and_in_which_role() {
 }
 
 #[test]
-fn who_may_only_watch_holds_nothing() {
+fn who_may_only_watch_holds_and_strikes_nothing() {
     let mut room = Room::new(HostSessionConfig { open: false, ..HostSessionConfig::default() });
     admit(&mut room, PeerId(1), Role::Watch);
     admit(&mut room, PeerId(2), Role::Hold);
@@ -298,12 +298,18 @@ fn who_may_only_watch_holds_nothing() {
         let guest = &mut room.guests[guest].1;
         while guest.poll_event().is_some() {}
         guest.begin_grab(now, BODY, 20, 0.05, [0.0; 3], Default::default()).unwrap();
+        guest.apply_impulse(now, BODY, 20, [0.0, 0.5, 0.0]).unwrap();
     }
     room.exchange();
-    let begun: Vec<UserId> = std::iter::from_fn(|| room.host.poll_event())
-        .filter_map(|e| if let HostEvent::GrabBegan { key, .. } = e { Some(key.user) } else { None })
-        .collect();
-    assert_eq!(begun, [UserId(2)]);
+    let (mut begun, mut struck) = (Vec::new(), Vec::new());
+    while let Some(event) = room.host.poll_event() {
+        match event {
+            HostEvent::GrabBegan { key, .. } => begun.push(key.user),
+            HostEvent::Impulse { user, .. } => struck.push(user),
+            _ => {}
+        }
+    }
+    assert_eq!((begun, struck), (vec![UserId(2)], vec![UserId(2)]));
     let refused = std::iter::from_fn(|| room.guests[0].1.poll_event())
         .any(|event| matches!(event, GuestEvent::GrabRefused { .. }));
     assert!(refused, "the watcher is told");

@@ -7,10 +7,12 @@ mod support;
 
 use std::time::{Duration, Instant};
 
+use pliant_modal::FixedObstacle;
 use pliant_stream::peer::PeerSession;
-use pliant_stream::wire::{Datagram, HeldAt, InputTick, Inputs};
-use pliant_stream::{Channel, PeerId};
-use support::direct::{BODY, peers};
+use pliant_stream::wire::{Datagram, HeldAt, ImpulseAt, InputTick, Inputs};
+use pliant_stream::{Channel, PeerId, Surroundings};
+use support::direct::{BODY, peers, peers_of};
+use support::loose_bar;
 
 /// How late the inputs come, ticks: one less than is remembered, and as late as can be afforded.
 const LATE: [u64; 2] = [127, 15];
@@ -26,7 +28,12 @@ fn sixteen(tick: u64) -> InputTick {
         target: [1.0, 0.05, 0.0],
         hold: Default::default(),
     };
-    InputTick { tick, held: (0..16).map(hand).collect() }
+    InputTick { tick, held: (0..16).map(hand).collect(), impulses: Vec::new() }
+}
+
+fn blows(tick: u64, count: u32) -> InputTick {
+    let blow = |k: u32| ImpulseAt { body: BODY, vertex: 4 + 3 * k, impulse: [0.0, 1e-3, 0.0] };
+    InputTick { tick, held: Vec::new(), impulses: (0..count).map(blow).collect() }
 }
 
 /// What the first peer has done in the attack, by update.
@@ -36,10 +43,13 @@ struct Cost {
     times: Vec<Duration>,
 }
 
-/// Ten seconds of the attack on the first peer, and ten seconds after it.
-fn attack(late: u64) -> (Vec<PeerSession>, Cost) {
-    let mut now = Duration::from_millis(1);
-    let mut all = peers(now);
+/// When the peers begin.
+const BEGIN: Duration = Duration::from_millis(1);
+
+/// Ten seconds of the attack on the first of three peers, and ten seconds after it. `input` is what
+/// the third peer does at a tick.
+fn attack(late: u64, mut all: Vec<PeerSession>, input: fn(u64) -> InputTick) -> (Vec<PeerSession>, Cost) {
+    let mut now = BEGIN;
     let mut cost = Cost { restepped: Vec::new(), patches: Vec::new(), times: Vec::new() };
     let counts = |peer: &PeerSession| {
         let body = peer.body(BODY).unwrap();
@@ -71,8 +81,7 @@ fn attack(late: u64) -> (Vec<PeerSession>, Cost) {
         let tick = all[0].tick();
         if attacks && tick > 200 + late {
             // One input for each tick, so that each update goes back as far as it can.
-            let inputs =
-                Inputs { now: tick, ahead: None, ticks: vec![sixteen(tick + 1 - late)], check: None };
+            let inputs = Inputs { now: tick, ahead: None, ticks: vec![input(tick + 1 - late)], check: None };
             let datagram = Datagram::Inputs(inputs).encode((round + 30_000) as u16);
             all[0].on_datagram(now, PeerId(2), &datagram);
         }
@@ -83,7 +92,7 @@ fn attack(late: u64) -> (Vec<PeerSession>, Cost) {
 #[test]
 fn inputs_as_late_as_can_be_with_new_patches_cost_a_bounded_amount_and_then_all_agree() {
     for late in LATE {
-        let (all, cost) = attack(late);
+        let (all, cost) = attack(late, peers(BEGIN), sixteen);
         let sum = |counts: &[u64]| counts.iter().sum::<u64>();
         let (steps, patches) = (sum(&cost.restepped), sum(&cost.patches));
         println!(
@@ -105,12 +114,41 @@ fn inputs_as_late_as_can_be_with_new_patches_cost_a_bounded_amount_and_then_all_
     }
 }
 
+#[test]
+fn late_impulses_are_paid_for_as_late_hands_are_and_contacts_besides() {
+    let ground = FixedObstacle { position: [0.0, -0.12, 0.0], ..FixedObstacle::GROUND };
+    let floor = Surroundings { obstacles: vec![ground], ..Surroundings::default() };
+    // A single impulse may come as late as can be, unless the body has contacts.
+    let among = || peers_of(BEGIN, &loose_bar(12, 0.05), &floor);
+    let apart = || peers_of(BEGIN, &loose_bar(12, 0.05), &Surroundings::default());
+    let eight = |tick| blows(tick, 8);
+    let one = |tick| blows(tick, 1);
+    for (what, late, all, input, most) in [
+        ("eight impulses", 127, peers(BEGIN), eight as fn(u64) -> InputTick, 17),
+        ("eight impulses", 15, peers(BEGIN), eight, 17),
+        ("one impulse", 127, apart(), one, 127),
+        ("one impulse with contacts", 127, among(), one, 17),
+    ] {
+        let (all, cost) = attack(late, all, input);
+        let largest = *cost.restepped.iter().max().unwrap();
+        println!("{what}, {late} ticks late: {largest} ticks stepped again at most at once");
+        let confirmed = all.iter().map(PeerSession::confirmed).min().unwrap();
+        let of = |k: usize| &all[k].state_at(BODY, confirmed).unwrap().q;
+        for k in [1, 2] {
+            let off: f64 = of(0).iter().zip(of(k)).map(|(a, b)| (a - b).abs()).sum();
+            assert!(off < 1e-6, "{what}: peer {}: {off}", k + 1);
+        }
+        assert!(largest <= most, "{what}: {:?}", cost.restepped);
+        assert!(most < 127 || largest > 100, "{what}: what can be afforded is taken");
+    }
+}
+
 /// The time of an update. Run by hand, on a quiet machine and with `--release`.
 #[test]
 #[ignore = "measures times"]
 fn time_of_an_update_while_inputs_come_as_late_as_can_be() {
     for late in LATE {
-        let (_, mut cost) = attack(late);
+        let (_, mut cost) = attack(late, peers(BEGIN), sixteen);
         cost.times.sort();
         let at = |share: f64| cost.times[(share * (cost.times.len() - 1) as f64) as usize];
         println!("{late} ticks late: median {:?}, p99 {:?}, longest {:?}", at(0.5), at(0.99), at(1.0));

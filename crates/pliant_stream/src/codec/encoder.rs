@@ -8,19 +8,19 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use pliant_modal::{ModalModel, StepSettings};
+use pliant_modal::{Frame, ModalModel, StepSettings};
 
-use crate::StreamError;
 use crate::codec::checksum::checksum;
 use crate::codec::quantization::Quanta;
 use crate::newmark::{Newmark, ViscoelasticFilter};
 use crate::prediction::{BodyCopy, HandState};
 use crate::replica::{self, Replica};
-use crate::state::{BodyId, GrabKey, GrabState, Tick, TickState};
+use crate::state::{BodyId, GrabKey, GrabState, RigidState, Tick, TickState};
 use crate::wire::{
     AccelerationCoding, Accelerations, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice, SliceEntry,
     SnapshotBytes, StreamSubscription, TickFrame, Writer, round24,
 };
+use crate::{StreamError, Surroundings};
 
 /// Number of ticks whose frames are kept for resending.
 pub(crate) const SENT: usize = 256;
@@ -90,6 +90,8 @@ pub struct Encoder {
     /// The receiver's copy, and the true state.
     mirror: BodyCopy,
     truth: BodyCopy,
+    /// The pose of a free body at the last tick, as it was sent.
+    pose: Option<RigidState>,
     load: Vec<f64>,
     unexplained: Vec<f64>,
     loaded: bool,
@@ -163,6 +165,7 @@ impl Encoder {
             replica,
             mirror: BodyCopy::new(rest.clone()),
             truth: BodyCopy::new(rest),
+            pose: None,
             load: vec![0.0; modes],
             unexplained: vec![0.0; modes],
             loaded: false,
@@ -187,6 +190,18 @@ impl Encoder {
     pub fn with_quantum(mut self, share: f64) -> Self {
         self.quantum = if share.is_finite() { share.clamp(1e-9, 0.1) } else { QUANTUM };
         self
+    }
+
+    /// Lets the receiver's copy touch what stands around the body, as receivers do
+    /// ([`Receiver::among`](crate::recovery::Receiver::among)).
+    ///
+    /// # Errors
+    /// Returns the errors of [`Surroundings::check`].
+    pub fn among(mut self, around: &Surroundings) -> Result<Self, StreamError> {
+        if self.subscription.payload == Payload::Forces {
+            self.replica.set_surroundings(around)?;
+        }
+        Ok(self)
     }
 
     /// Number of modes that a stream carries. The limits are the subscription, the model and, for
@@ -223,6 +238,8 @@ impl Encoder {
                 .iter()
                 .map(|hand| (hand.key.user.0, hand.key.grab, hand.mean.into()))
                 .collect(),
+            contacts: self.mirror.contacts.clone(),
+            pose: self.pose,
             resting,
         }
     }
@@ -235,8 +252,13 @@ impl Encoder {
     }
 
     /// Takes over the true state as it is. The next frame begins a new run, and receivers need a
-    /// [`Encoder::snapshot`].
+    /// [`Encoder::snapshot`]. The contacts of the last step go on.
     pub fn restart(&mut self, state: &TickState<'_>) {
+        self.pose = state.pose.map(RigidState::rounded);
+        if let Some(pose) = self.pose.as_mut().filter(|_| state.resting) {
+            (pose.linear, pose.angular) = ([0.0; 3], [0.0; 3]);
+        }
+        replica::place(&mut self.mirror.state, self.replica.model(), self.pose.as_ref());
         let mirror = &mut self.mirror;
         replica::fill(&mut mirror.state, [state.q, state.v, state.a, state.z]);
         if state.resting {
@@ -282,8 +304,8 @@ impl Encoder {
 
     /// Encodes the tick after the last one. The bytes have no datagram header yet.
     pub fn encode(&mut self, state: &TickState<'_>) -> Encoded {
-        replica::place(&mut self.mirror.state, self.replica.model(), state.pose.as_ref());
-        self.truth.state.frame = self.mirror.state.frame;
+        self.pose = state.pose.map(RigidState::rounded);
+        let frame = self.replica.end_frame(&self.mirror, self.pose.as_ref());
         let forces = self.subscription.payload == Payload::Forces;
         let grabs: Vec<FrameGrab> = state
             .grabs
@@ -309,11 +331,12 @@ impl Encoder {
         let accelerations = match self.subscription.payload {
             Payload::Accelerations(coding) => Some(self.step_accelerations(coding, state, unit)),
             Payload::Forces => {
-                self.step_forces(&grabs, state);
+                self.step_forces(&grabs, state, frame);
                 None
             }
         };
         replica::fill(&mut self.truth.state, [state.q, state.v, state.a, state.z]);
+        self.truth.state.frame = self.mirror.state.frame;
         let run = state.tick - self.started.unwrap_or(state.tick) - 1;
         let mut frame = TickFrame {
             body: self.body,
@@ -470,7 +493,7 @@ impl Encoder {
 
     /// Steps the mirror with the quantized reactions and updates the estimate of the load that they
     /// leave unexplained.
-    fn step_forces(&mut self, grabs: &[FrameGrab], state: &TickState<'_>) {
+    fn step_forces(&mut self, grabs: &[FrameGrab], state: &TickState<'_>, frame: Option<Frame>) {
         if self.frames.is_multiple_of(LOAD_EVERY) {
             // The step starts from the true state of the previous tick, as a receiver without error
             // would.
@@ -478,7 +501,8 @@ impl Encoder {
             let to = [state.q, state.v];
             self.truth.state.f.clone_from(&self.mirror.state.f);
             let hands = self.truth.hands.clone();
-            self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut lacking);
+            self.truth.contacts.clone_from(&self.mirror.contacts);
+            self.replica.lacking(&mut self.truth, to, grabs, &self.load, frame, &mut lacking);
             self.truth.hands = hands;
             let share = LOAD_EVERY as f64 / LOAD_TICKS;
             for ((estimate, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
@@ -486,7 +510,7 @@ impl Encoder {
             }
             self.scratch = lacking;
         }
-        self.replica.step_measured(&mut self.mirror, grabs, &self.load);
+        self.replica.step_measured(&mut self.mirror, grabs, &self.load, frame);
         let hands = grabs.iter().map(|g| {
             let (key, end) = (g.state.key, -Vector3::from(g.state.reaction));
             HandState::of_mean(key, self.replica.mean(end, self.truth.mean(key), grabs.len()))

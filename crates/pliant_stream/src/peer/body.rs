@@ -5,15 +5,15 @@ use std::sync::Arc;
 use nalgebra::{UnitQuaternion, Vector3};
 use pliant_modal::{Frame, Load, ModalModel, StepSettings};
 
-use super::inputs::{InputLog, WINDOW};
-use crate::StreamError;
+use super::inputs::{BodyInputs, InputLog, WINDOW};
 use crate::codec::checksum::{checksum, projection};
 use crate::newmark::{Newmark, ViscoelasticFilter};
 use crate::prediction::{BodyCopy, HandState, Ring, Rollback, VisualCopy};
 use crate::recovery::Forecast;
 use crate::replica::Replica;
 use crate::state::{BodyId, GrabKey, GrabState, RigidState, State, Tick, UserId};
-use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerHandState};
+use crate::wire::{PeerBodyState, PeerFrame, PeerHandState};
+use crate::{StreamError, Surroundings};
 
 /// Correction of the state for a late input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -35,14 +35,15 @@ pub struct PeerBody {
     pub(crate) id: BodyId,
     pub(crate) model: Arc<ModalModel>,
     replica: Replica,
+    around: Surroundings,
     forecast: Forecast,
     newmark: Newmark,
     viscoelastic: Option<ViscoelasticFilter>,
     repair: LateInputRepair,
     rollback: Rollback,
     /// The inputs of the last step, and those that each tick was stepped with.
-    held: Vec<(UserId, HeldAt)>,
-    used: Ring<Vec<(UserId, HeldAt)>>,
+    inputs: BodyInputs,
+    used: Ring<BodyInputs>,
     visual: VisualCopy,
     grabs: Vec<GrabState>,
     restepped: u64,
@@ -65,6 +66,7 @@ impl PeerBody {
             visual: VisualCopy::new(&model, rest.clone(), h, blend_ticks),
             model,
             replica,
+            around: Surroundings::default(),
             forecast: Forecast::new(h),
             viscoelastic: settings
                 .relaxation
@@ -73,11 +75,28 @@ impl PeerBody {
             repair,
             // A rollback can return to the initial state like to any other tick.
             rollback: Rollback::new(BodyCopy::new(rest), WINDOW),
-            held: Vec::new(),
+            inputs: BodyInputs::default(),
             used: Ring::new(WINDOW),
             grabs: Vec::new(),
             restepped: 0,
         })
+    }
+
+    /// Lets the body touch what stands around it, from the next step on.
+    pub(crate) fn set_surroundings(&mut self, around: Surroundings) -> Result<(), StreamError> {
+        self.replica.set_surroundings(&around)?;
+        self.around = around;
+        Ok(())
+    }
+
+    /// Whether the body may touch anything.
+    pub(crate) fn touches(&self) -> bool {
+        self.replica.touches()
+    }
+
+    /// What stands still around the body.
+    pub fn surroundings(&self) -> &Surroundings {
+        &self.around
     }
 
     /// Number of the body.
@@ -171,7 +190,7 @@ impl PeerBody {
     }
 
     pub(crate) fn export(&self, tick: Tick) -> Option<PeerBodyState> {
-        let BodyCopy { state, hands } = self.rollback.at(tick)?;
+        let BodyCopy { state, hands, contacts } = self.rollback.at(tick)?;
         Some(PeerBodyState {
             body: self.id.0,
             q: state.q.clone(),
@@ -196,6 +215,7 @@ impl PeerBody {
                     viscoelastic: hand.viscoelastic.into(),
                 })
                 .collect(),
+            contacts: contacts.clone(),
         })
     }
 
@@ -223,7 +243,8 @@ impl PeerBody {
             viscoelastic: p.viscoelastic.into(),
         };
         let hands = state.pulls.iter().map(hand).collect();
-        let before = std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands });
+        let contacts = state.contacts.clone();
+        let before = std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands, contacts });
         let fresh = self.tick() == 0;
         self.reach(tick);
         while self.tick() < to {
@@ -257,32 +278,41 @@ impl PeerBody {
             return false;
         }
         let before = self.live().clone();
-        match self.repair {
-            LateInputRepair::Rollback => {
-                self.rollback.back_to(base);
-                while self.tick() < to {
-                    self.step_once(inputs);
-                    self.restepped += 1;
-                }
+        if self.repair == LateInputRepair::Compensate && !self.lacks_impulse(from, inputs) {
+            self.compensate(from, inputs);
+        } else {
+            self.rollback.back_to(base);
+            while self.tick() < to {
+                self.step_once(inputs);
+                self.restepped += 1;
             }
-            LateInputRepair::Compensate => self.compensate(from, inputs),
         }
         self.visual.add(&self.model, &before, &self.rollback.now.state);
         true
     }
 
+    /// Whether an impulse at tick `from` or later did not act yet. It changes velocities at once,
+    /// which no acceleration of equations (8) and (9) does.
+    fn lacks_impulse(&self, from: Tick, inputs: &InputLog) -> bool {
+        let mut known = BodyInputs::default();
+        (from..=self.tick()).any(|tick| {
+            inputs.of_body(tick, self.id, &self.forecast, &mut known);
+            self.used.get(tick).is_none_or(|used| used.impulses != known.impulses)
+        })
+    }
+
     /// Applies equations (8) and (9) to every tick from `from` on whose known inputs differ from
     /// those used.
     fn compensate(&mut self, from: Tick, inputs: &InputLog) {
-        let (mut held, last) = (Vec::new(), self.tick());
+        let (mut done, last) = (BodyInputs::default(), self.tick());
         for tick in from..=last {
-            let known = inputs.held(tick, self.id, &self.forecast, &mut held);
-            let Some(used) = self.used.get_mut(tick).filter(|used| known && held != **used) else { continue };
+            let known = inputs.of_body(tick, self.id, &self.forecast, &mut done);
+            let Some(used) = self.used.get_mut(tick).filter(|used| known && done != **used) else { continue };
             let Some(before) = self.rollback.at(tick - 1) else { continue };
             let (mut with, mut without) = (before.clone(), before.clone());
-            Self::press(&mut self.replica, &mut with, &held);
+            Self::press(&mut self.replica, &mut with, &done);
             Self::press(&mut self.replica, &mut without, used);
-            used.clone_from(&held);
+            used.clone_from(&done);
             let (with_frame, without_frame) = (with.state.frame, without.state.frame);
             // The history is corrected like the present state, because later corrections and checks
             // use it.
@@ -317,15 +347,18 @@ impl PeerBody {
 
     fn step_once(&mut self, inputs: &InputLog) {
         let tick = self.tick() + 1;
-        inputs.held(tick, self.id, &self.forecast, &mut self.held);
-        Self::press(&mut self.replica, &mut self.rollback.now, &self.held);
+        inputs.of_body(tick, self.id, &self.forecast, &mut self.inputs);
+        Self::press(&mut self.replica, &mut self.rollback.now, &self.inputs);
         self.reach(tick);
     }
 
-    /// Steps a copy once with the hands of the inputs.
-    fn press(replica: &mut Replica, copy: &mut BodyCopy, held: &[(UserId, HeldAt)]) {
+    /// Steps a copy once with the impulses and the hands of the inputs.
+    fn press(replica: &mut Replica, copy: &mut BodyCopy, inputs: &BodyInputs) {
+        for (_, i) in &inputs.impulses {
+            replica.apply_impulse(copy, i.vertex, i.impulse);
+        }
         replica.release_all();
-        for (user, g) in held {
+        for (user, g) in &inputs.held {
             // All peers ignore the same patches. A patch larger than the body would visit every
             // vertex of the body.
             if g.radius <= replica.model().size() {
@@ -338,14 +371,14 @@ impl PeerBody {
     /// Remembers the copy, and the inputs of the last step, as those of `tick`.
     fn reach(&mut self, tick: Tick) {
         self.rollback.reach(tick);
-        self.used.place(tick).0.clone_from(&self.held);
+        self.used.place(tick).0.clone_from(&self.inputs);
     }
 
     fn show(&mut self) {
         let copy = &self.rollback.now;
         self.visual.show(&self.model, &copy.state);
         self.grabs.clear();
-        for (user, g) in &self.held {
+        for (user, g) in &self.inputs.held {
             let key = g.key(*user);
             let pull = copy.hand(key).map_or_else(Vector3::zeros, |hand| hand.pull);
             self.grabs.push(GrabState {

@@ -79,6 +79,14 @@ pub enum PeerEvent {
         /// Where peers that join later reach the other peer; empty if nowhere.
         address: String,
     },
+    /// Another peer is connected with peers that this one does not have in its session. Of two
+    /// that are introduced to each other, the one with the higher number should connect.
+    Introduced {
+        /// The connection that told of them.
+        peer: PeerId,
+        /// User numbers and addresses.
+        others: Vec<(UserId, String)>,
+    },
     /// Another peer left.
     Left {
         /// User number.

@@ -1,14 +1,21 @@
-//! The inputs of all users' hands, tick by tick.
+//! What all users do, tick by tick.
 
 use std::collections::BTreeMap;
 
 use crate::prediction::Ring;
 use crate::recovery::Forecast;
 use crate::state::{BodyId, Tick, UserId};
-use crate::wire::{HeldAt, InputTick};
+use crate::wire::{HeldAt, ImpulseAt, InputTick};
 
 /// Number of ticks remembered.
 pub(crate) const WINDOW: usize = 128;
+
+/// What all users do with one body at one tick, by user.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct BodyInputs {
+    pub(crate) held: Vec<(UserId, HeldAt)>,
+    pub(crate) impulses: Vec<(UserId, ImpulseAt)>,
+}
 
 /// Inputs of one user.
 #[derive(Debug)]
@@ -115,21 +122,25 @@ impl InputLog {
         self.users.get_mut(&user).is_some_and(|u| u.put(input))
     }
 
-    /// Collects all grabs of a body at a tick, by user. Returns true when all inputs are known.
-    pub(crate) fn held(
+    /// Collects the grabs of a body and the impulses on it at a tick, by user. Returns true when
+    /// all inputs are known. Hands go on where they are not, and impulses are never guessed.
+    pub(crate) fn of_body(
         &self,
         tick: Tick,
         body: BodyId,
         forecast: &Forecast,
-        out: &mut Vec<(UserId, HeldAt)>,
+        out: &mut BodyInputs,
     ) -> bool {
-        out.clear();
+        out.held.clear();
+        out.impulses.clear();
         let mut known = true;
         let mut held = Vec::new();
         for (user, inputs) in &self.users {
             held.clear();
             known &= inputs.held(tick, forecast, &mut held);
-            out.extend(held.iter().filter(|g| g.body == body).map(|g| (*user, *g)));
+            out.held.extend(held.iter().filter(|g| g.body == body).map(|g| (*user, *g)));
+            let impulses = inputs.at(tick).map_or(&[][..], |input| &input.impulses);
+            out.impulses.extend(impulses.iter().filter(|i| i.body == body).map(|i| (*user, *i)));
         }
         known
     }
@@ -152,7 +163,7 @@ mod tests {
         for user in 0..1000_u16 {
             let (user, tick) = (UserId(user), 10 * (u64::from(user) + 1));
             log.expect(user, tick);
-            assert!(log.put(user, InputTick { tick, held: Vec::new() }));
+            assert!(log.put(user, InputTick { tick, ..Default::default() }));
             if let Some(u) = log.users.get_mut(&user) {
                 u.gone = true;
             }

@@ -19,4 +19,6 @@ mod session;
 
 pub use body::{LateInputRepair, PeerBody};
 pub use config::{PeerEvent, PeerSessionConfig};
+#[cfg(test)]
+pub(crate) use inputs::InputLog;
 pub use session::PeerSession;

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use crate::link::{Budget, Link};
 use crate::state::{BodyId, PeerId, Tick, UserId};
+use crate::wire::PeerBodyState;
 
 /// Number of consecutive mismatches after which the other peer's state is taken.
 const CHECKS: u32 = 3;
@@ -19,9 +20,19 @@ pub(super) struct Hello {
     pub(super) joining: bool,
 }
 
+/// A state whose last message has not arrived.
+#[derive(Debug)]
+pub(super) struct PartialState {
+    pub(super) tick: Tick,
+    /// One for each body, so that nobody fills the memory.
+    pub(super) bodies: BTreeMap<u16, PeerBodyState>,
+}
+
 #[derive(Debug)]
 pub(super) struct RemotePeer {
     pub(super) link: Link,
+    /// When the peer last told of others.
+    pub(super) told_at: Option<Duration>,
     /// User number of the peer, after its hello.
     pub(super) user: Option<UserId>,
     /// User number that the peer must have; `None` when its hello tells it.
@@ -46,6 +57,8 @@ pub(super) struct RemotePeer {
     pub(super) wants_state: bool,
     /// This peer has requested the other's state and has no answer yet.
     pub(super) asked_state: bool,
+    /// What has come of the peer's state.
+    pub(super) partial: Option<PartialState>,
     /// Budget of what the peer's late inputs cost: for each tick that is stepped again, one and one
     /// for each hand.
     pub(super) late_budget: Budget,
@@ -65,6 +78,7 @@ impl RemotePeer {
         link.repeats = Budget::new(1000.0, 1000.0);
         Self {
             link,
+            told_at: None,
             user: None,
             expected,
             greeted: false,
@@ -78,6 +92,7 @@ impl RemotePeer {
             lost: false,
             wants_state: false,
             asked_state: false,
+            partial: None,
             // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
             // each tick, one with one hand may be 96 ticks late, and one with ten 17.
             late_budget: Budget::new(192.0 / step, 256.0),

@@ -1,5 +1,6 @@
 //! The session of one peer with all other peers.
 
+mod introductions;
 mod states;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -8,22 +9,30 @@ use std::time::Duration;
 
 use pliant_modal::{GrabConfig, ModalModel, StepSettings};
 
+use introductions::Introductions;
+
 use super::body::PeerBody;
 use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
 use super::other::{Hello, RemotePeer};
-use crate::StreamError;
 use crate::link::Events;
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range, next_free};
 use crate::wire::{
-    Datagram, HeldAt, InputTick, Inputs, MAX_ADDRESS, MAX_BODIES, MAX_HELD, MAX_NACK_RUN, MAX_NACK_RUNS,
-    MAX_NAME, MAX_PEERS, MAX_TICKS, NackRun, PROTOCOL_VERSION, PeerMessage, StateCheck, check_hold,
+    Datagram, HeldAt, ImpulseAt, InputTick, Inputs, MAX_ADDRESS, MAX_BODIES, MAX_HELD, MAX_IMPULSES,
+    MAX_NACK_RUN, MAX_NACK_RUNS, MAX_NAME, MAX_PEERS, MAX_TICKS, NackRun, PROTOCOL_VERSION, PeerMessage,
+    StateCheck, check_hold,
 };
+use crate::{StreamError, Surroundings};
 
 /// Largest number of outputs that wait to be fetched before new datagrams are dropped, as a path
 /// would drop them.
 const MAX_OUT: usize = 16_384;
+/// Largest number of coordinates of all bodies. A state of them, which a peer collects from each
+/// other one, then has 21 MB, besides hands and contacts.
+const MAX_COORDINATES: usize = 1 << 19;
+/// What a tick that is stepped again with contacts costs more than one without, see [`RemotePeer`].
+const CONTACT_COST: u64 = 4;
 /// Number of ticks between checks.
 const CHECK_EVERY: u64 = 16;
 /// Tolerance of checks as a share of the state's magnitude. Machines of different peers round
@@ -47,9 +56,12 @@ pub struct PeerSession {
     others: BTreeMap<PeerId, RemotePeer>,
     /// What peers are told of where this one is reached, if not the address of the settings.
     addresses: BTreeMap<PeerId, String>,
+    introductions: Introductions,
     bodies: BTreeMap<BodyId, PeerBody>,
     inputs: InputLog,
     own: BTreeMap<u16, HeldAt>,
+    /// Own impulses that the next step applies.
+    impulses: Vec<ImpulseAt>,
     next_grab: u16,
     tick: Tick,
     started: bool,
@@ -105,9 +117,11 @@ impl PeerSession {
             config,
             others: BTreeMap::new(),
             addresses: BTreeMap::new(),
+            introductions: Introductions::default(),
             bodies: BTreeMap::new(),
             inputs,
             own: BTreeMap::new(),
+            impulses: Vec::new(),
             next_grab: 0,
             tick: 0,
             started,
@@ -129,7 +143,8 @@ impl PeerSession {
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for a number in use, [`StreamError::Full`] beyond 1,024
-    /// bodies, and [`StreamError::Model`] for a model or settings that cannot be stepped.
+    /// bodies or 524,288 coordinates of all bodies, and [`StreamError::Model`] for a model or
+    /// settings that cannot be stepped.
     pub fn add_body(
         &mut self,
         id: BodyId,
@@ -143,13 +158,27 @@ impl PeerSession {
         if self.bodies.len() >= MAX_BODIES {
             return Err(StreamError::Full { what: "bodies", limit: MAX_BODIES });
         }
+        let before: usize = self.bodies.values().map(|body| body.model().mode_count()).sum();
+        if before + model.mode_count() > MAX_COORDINATES {
+            return Err(StreamError::Full { what: "coordinates of all bodies", limit: MAX_COORDINATES });
+        }
         let c = &self.config;
         let body = PeerBody::new(id, model, settings, c.step, c.repair, c.blend_ticks)?;
         self.bodies.insert(id, body);
         Ok(())
     }
 
-    /// Digest of the bodies, their models and step settings, and the step length.
+    /// Lets a free body touch what stands still around it. All peers set the same before they
+    /// connect.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::UnknownBody`] for an unknown body, and the errors of
+    /// [`Surroundings::check`]. The old surroundings then stay.
+    pub fn set_surroundings(&mut self, id: BodyId, around: Surroundings) -> Result<(), StreamError> {
+        self.bodies.get_mut(&id).ok_or(StreamError::UnknownBody(id))?.set_surroundings(around)
+    }
+
+    /// Digest of the bodies, their models, step settings and surroundings, and the step length.
     pub fn scene(&self) -> u64 {
         let mut hasher = blake3::Hasher::new();
         hasher.update(&self.config.step.to_bits().to_le_bytes());
@@ -157,6 +186,7 @@ impl PeerSession {
             hasher.update(&id.0.to_le_bytes());
             hasher.update(&body.model().hash().0);
             hasher.update(&body.settings().to_bytes());
+            hasher.update(&body.surroundings().to_bytes());
         }
         let mut first = [0; 8];
         first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
@@ -402,6 +432,34 @@ impl PeerSession {
         self.own.remove(&grab);
     }
 
+    /// Applies an impulse (N s, world axes) to a surface vertex of a body at the next tick, at all
+    /// peers. It brings the body at most
+    /// [`MAX_IMPULSE_SPEED`](crate::MAX_IMPULSE_SPEED) and is rounded to single precision.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::UnknownBody`] for an unknown body, [`StreamError::NotFinite`] for an
+    /// impulse out of range, [`StreamError::Model`] for a vertex that the model lacks,
+    /// [`StreamError::State`] before this peer steps, and [`StreamError::Full`] beyond 8 impulses a
+    /// tick.
+    pub fn apply_impulse(&mut self, body: BodyId, vertex: u32, impulse: [f64; 3]) -> Result<(), StreamError> {
+        let b = self.bodies.get(&body).ok_or(StreamError::UnknownBody(body))?;
+        if !in_range(&impulse) {
+            return Err(StreamError::NotFinite { what: "impulse" });
+        }
+        if vertex as usize >= b.model().surface().positions().len() {
+            return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
+        }
+        if !self.started {
+            let (what, state) = ("apply_impulse", "not started");
+            return Err(StreamError::State { what, state, needed: "a state from the others" });
+        }
+        if self.impulses.len() >= MAX_IMPULSES {
+            return Err(StreamError::Full { what: "impulses", limit: MAX_IMPULSES });
+        }
+        self.impulses.push(ImpulseAt { body, vertex, impulse }.rounded());
+        Ok(())
+    }
+
     /// Metrics of a connection; `None` for an unknown connection.
     ///
     /// They are the traffic in both directions, the share of datagrams lost on the path to this
@@ -542,17 +600,11 @@ impl PeerSession {
                 waiting.into_iter().for_each(|peer| self.take_hello(peer));
             }
             Ok(PeerMessage::StateRequest) => other.wants_state = true,
-            Ok(PeerMessage::State { tick, now: theirs, bodies }) => {
-                let Some(user) = other.user else { return };
-                // A joining peer has asked all peers by its hello. After that, a state is taken
-                // only on request and only from a lower number. A peer that could send a state at
-                // will could force any shape on any peer.
-                let asked = std::mem::take(&mut other.asked_state);
-                if !self.started || (asked && user < self.config.user) {
-                    self.take_state(now, user, tick, theirs, &bodies);
-                }
+            Ok(PeerMessage::State { tick, now: theirs, more, bodies }) => {
+                self.take_part(now, peer, [tick, theirs], more, bodies);
             }
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
+            Ok(PeerMessage::Others { others }) => self.take_others(now, peer, others),
             Err(_) => {
                 other.link.reject();
                 self.turn_away(peer, DisconnectReason::Protocol);
@@ -574,6 +626,7 @@ impl PeerSession {
         if !self.started {
             return 0;
         }
+        self.tell_others(now);
         self.roll_back();
         let mut stepped = 0;
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
@@ -644,7 +697,8 @@ impl PeerSession {
     fn step(&mut self) {
         self.tick += 1;
         let held = self.own.values().copied().collect();
-        self.inputs.put(self.config.user, InputTick { tick: self.tick, held });
+        let impulses = std::mem::take(&mut self.impulses);
+        self.inputs.put(self.config.user, InputTick { tick: self.tick, held, impulses });
         for body in self.bodies.values_mut() {
             body.advance(&self.inputs);
         }
@@ -813,7 +867,12 @@ fn affords(
     planned: Tick,
 ) -> bool {
     let again = planned.saturating_sub(input.tick);
-    let cost = again * (1 + input.held.len() as u64);
+    // A step with contacts takes as long as several without.
+    let held = input.held.iter().map(|held| held.body);
+    let mut touched = held.chain(input.impulses.iter().map(|impulse| impulse.body));
+    let touches = touched.any(|body| bodies.get(&body).is_some_and(PeerBody::touches));
+    let done = input.held.len() + input.impulses.len();
+    let cost = again * (1 + done as u64 + if touches { CONTACT_COST } else { 0 });
     let patch = |held: &HeldAt| match bodies.get(&held.body) {
         Some(body) if !body.has_patch(held.vertex, held.radius) => {
             other.link.patches.spend(now, body.model(), held.vertex, held.radius)

@@ -1,7 +1,8 @@
-//! The state of a body with its hands, as one step leaves it and the next one needs it.
+//! The state of a body with its hands and contacts, as one step leaves it and the next one needs
+//! it.
 
 use nalgebra::Vector3;
-use pliant_modal::State;
+use pliant_modal::{ContactState, State};
 
 use crate::state::GrabKey;
 
@@ -28,29 +29,32 @@ impl HandState {
     }
 }
 
-/// A state and its hands. A step of [`Replica`](crate::replica::Replica) replaces both.
+/// A state with its hands and its contacts. A step of [`Replica`](crate::replica::Replica) replaces
+/// all.
 #[derive(Debug, Default)]
 pub(crate) struct BodyCopy {
     pub state: State,
     pub hands: Vec<HandState>,
+    pub contacts: ContactState,
 }
 
 impl Clone for BodyCopy {
     fn clone(&self) -> Self {
-        Self { state: self.state.clone(), hands: self.hands.clone() }
+        Self { state: self.state.clone(), hands: self.hands.clone(), contacts: self.contacts.clone() }
     }
 
     /// Copies into the memory that is there, because every tick is remembered.
     fn clone_from(&mut self, from: &Self) {
         self.state.clone_from(&from.state);
         self.hands.clone_from(&from.hands);
+        self.contacts.clone_from(&from.contacts);
     }
 }
 
 impl BodyCopy {
-    /// A copy without hands.
+    /// A copy without hands and contacts.
     pub(crate) fn new(state: State) -> Self {
-        Self { state, hands: Vec::new() }
+        Self { state, hands: Vec::new(), contacts: ContactState::default() }
     }
 
     pub(crate) fn hand(&self, key: GrabKey) -> Option<&HandState> {

@@ -266,6 +266,7 @@ impl PredictedHand {
             self.lead = guess.min(REMEMBERED - 1);
             self.take(receiver.visual());
             replica::place(&mut self.copy.state, self.replica.model(), receiver.pose().as_ref());
+            self.copy.contacts = receiver.contacts().cloned().unwrap_or_default();
             self.visual.state.clone_from(&self.copy.state);
             self.visual.clear();
         }
@@ -309,6 +310,10 @@ impl PredictedHand {
         if let Some(frame) = frame {
             copy.state.frame = frame;
         }
+        match receiver.contacts() {
+            Some(contacts) => copy.contacts.clone_from(contacts),
+            None => copy.contacts.forget(),
+        }
         copy.hands.clear();
         copy.hands.extend_from_slice(receiver.hands());
         for g in &mut self.grabs {
@@ -325,8 +330,9 @@ impl PredictedHand {
         }
     }
 
-    /// Estimates what drives the frame of a free body besides gravity and the streamed hands
-    /// (contacts), from the last two confirmed ticks, smoothed.
+    /// Estimates what drives the frame of a free body besides gravity, the streamed hands and the
+    /// contacts that the copy steps itself (other bodies, other loads), from the last two confirmed
+    /// ticks, smoothed.
     fn learn_push(&mut self, receiver: &Receiver, now: Option<Frame>) {
         let last = std::mem::replace(&mut self.last_frame, now);
         let (Some(mut from), Some(to)) = (last, now) else { return };
@@ -334,7 +340,7 @@ impl PredictedHand {
         let zero = Vector3::zeros();
         let gravity = Vector3::from(receiver.settings().gravity);
         let rigid = RigidMotion::predict(&mut from, &model, h, gravity, zero, zero);
-        let (mut force, mut torque) = (zero, zero);
+        let [mut force, mut torque] = receiver.contact_push();
         let tick = receiver.tick();
         let mut patches = Vec::with_capacity(receiver.grabs().len());
         patches.extend(receiver.grabs().iter().map(|g| (g.key, g.vertex, g.radius)));
@@ -376,20 +382,11 @@ impl PredictedHand {
     fn one_step(&mut self, copy: &mut BodyCopy, receiver: &Receiver, user: UserId, j: usize) {
         let history = receiver.history();
         let tick = receiver.tick() + j as u64;
-        let (free, h) = (self.replica.model().is_free(), self.replica.kernel().h());
         self.replica.release_all();
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
             let at = |tick| history.grab(g.key, tick, &self.forecast);
             let Some(now) = at(tick) else { continue };
-            let held = self.replica.hold_measured(copy, &now);
-            if let (true, Some(hand)) = (free, held) {
-                // The frame moves on from the confirmed one. The remote hand is therefore held at
-                // its extrapolated target, by its own spring and damper, not where the patch was.
-                let target = Vector3::from(now.state.target);
-                let way = at(tick - 1).map(|before| target - Vector3::from(before.state.target));
-                let velocity = way.map_or_else(Vector3::zeros, |way| way / h);
-                hand.hold = Hold::Target { target, velocity, config: now.state.hold };
-            }
+            self.replica.hold_streamed(copy, &now, at(tick - 1).as_ref());
         }
         for g in &self.grabs {
             // The newest target is the one that arrives `lead` ticks after the confirmed tick.

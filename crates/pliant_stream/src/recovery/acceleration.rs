@@ -1,7 +1,7 @@
 //! Policies that integrate a stream of accelerations: [`super::Policy::None`] and the paper's
 //! policy.
 
-use pliant_modal::Relaxation;
+use pliant_modal::{ContactState, Relaxation};
 
 use super::{HISTORY, History, Predict, Recovery};
 use crate::newmark::{Newmark, ViscoelasticFilter};
@@ -78,7 +78,7 @@ impl AccelerationDriven {
 }
 
 impl Recovery for AccelerationDriven {
-    fn restart(&mut self, tick: Tick, state: &State, _load: &[f64], _hands: &[HandState]) {
+    fn restart(&mut self, tick: Tick, state: &State, _: &[f64], _: &[HandState], _: &ContactState) {
         replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
         self.tick = tick;
         self.first = tick;

@@ -1,5 +1,8 @@
 //! The force-driven policy: the receiver steps its own damped model with the streamed reactions.
 
+use nalgebra::Vector3;
+use pliant_modal::{ContactState, Frame, Load};
+
 use super::{Forecast, HISTORY, History, Recovery};
 use crate::prediction::{BodyCopy, HandState, Rollback};
 use crate::replica::{self, Replica};
@@ -15,6 +18,8 @@ pub struct ForceDriven {
     first: Tick,
     rollback: Rollback,
     load: Vec<f64>,
+    /// The contact forces of the last step, see [`Recovery::contact_push`].
+    push: [Vector3<f64>; 2],
     grabs: Vec<FrameGrab>,
     forecast: Forecast,
 }
@@ -26,6 +31,7 @@ impl ForceDriven {
         Self {
             first: 0,
             load: vec![0.0; state.modes()],
+            push: [Vector3::zeros(); 2],
             rollback: Rollback::new(BodyCopy::new(state), HISTORY),
             grabs: Vec::new(),
             forecast,
@@ -41,12 +47,25 @@ impl ForceDriven {
             self.grabs
                 .extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, &self.forecast)));
         }
-        let copy = &mut self.rollback.now;
-        if self.replica.model().is_free() {
-            let pose = history.pose(tick, self.replica.kernel().h());
-            replica::place(&mut copy.state, self.replica.model(), pose.as_ref());
+        let (copy, replica) = (&mut self.rollback.now, &mut self.replica);
+        let touches = replica.touches();
+        // A guess of the pose would lead through the floor. A body that touches is stepped instead.
+        let pose =
+            if touches { history.received_pose(tick) } else { history.pose(tick, replica.kernel().h()) };
+        let frame = replica.end_frame(copy, pose.as_ref());
+        if touches && frame.is_none() {
+            replica.release_all();
+            for g in &self.grabs {
+                let before = history.grab(g.state.key, tick.saturating_sub(1), &self.forecast);
+                replica.hold_streamed(copy, g, before.as_ref());
+            }
+            replica.step_held(copy, &Load { modal: &self.load, ..Load::default() });
+        } else {
+            replica.step_measured(copy, &self.grabs, &self.load, frame);
         }
-        self.replica.step_measured(copy, &self.grabs, &self.load);
+        if touches {
+            self.push = replica.contact_push(&Vector3::from(copy.state.frame.center()));
+        }
         self.take_slice(tick, history);
         self.rollback.reach(tick);
     }
@@ -67,9 +86,18 @@ impl ForceDriven {
 }
 
 impl Recovery for ForceDriven {
-    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], hands: &[HandState]) {
+    fn restart(
+        &mut self,
+        tick: Tick,
+        state: &State,
+        load: &[f64],
+        hands: &[HandState],
+        contacts: &ContactState,
+    ) {
         let (copy, modes) = (&mut self.rollback.now, self.load.len());
         replica::fill(&mut copy.state, [&state.q, &state.v, &state.a, &state.z]);
+        copy.state.frame = state.frame;
+        copy.contacts.clone_from(contacts);
         copy.hands.clear();
         copy.hands.extend_from_slice(hands);
         self.load.clear();
@@ -101,6 +129,18 @@ impl Recovery for ForceDriven {
 
     fn load(&self) -> &[f64] {
         &self.load
+    }
+
+    fn frame(&self) -> Option<&Frame> {
+        self.replica.touches().then_some(&self.rollback.now.state.frame)
+    }
+
+    fn contacts(&self) -> Option<&ContactState> {
+        Some(&self.rollback.now.contacts)
+    }
+
+    fn contact_push(&self) -> [Vector3<f64>; 2] {
+        self.push
     }
 
     fn hands(&self) -> &[HandState] {

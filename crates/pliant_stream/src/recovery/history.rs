@@ -45,12 +45,14 @@ pub struct TickData {
 pub struct History {
     slots: Ring<TickData>,
     highest: Tick,
+    /// The rigid pose of the last snapshot.
+    snapshot: Option<(Tick, RigidState)>,
 }
 
 impl History {
     /// Creates an empty history. `tick` is the tick before the first tick of interest.
     pub fn new(tick: Tick) -> Self {
-        Self { slots: Ring::new(HISTORY), highest: tick }
+        Self { slots: Ring::new(HISTORY), highest: tick, snapshot: None }
     }
 
     /// The newest tick for which data has arrived.
@@ -73,10 +75,21 @@ impl History {
         (0..HISTORY as u64).map_while(|back| tick.checked_sub(back)).find_map(|t| self.known(t))
     }
 
+    /// Stores the rigid pose of a snapshot.
+    pub fn take_pose(&mut self, tick: Tick, pose: Option<RigidState>) {
+        self.snapshot = pose.map(|pose| (tick, pose)).or(self.snapshot);
+    }
+
+    /// The rigid pose at `tick`, if it was received.
+    pub fn received_pose(&self, tick: Tick) -> Option<RigidState> {
+        let in_snapshot = || self.snapshot.filter(|(at, _)| *at == tick).map(|(_, pose)| pose);
+        self.known(tick).and_then(|d| d.pose).or_else(in_snapshot)
+    }
+
     /// The rigid pose at `tick`, with `h` seconds per tick: received, interpolated between
     /// neighbors, or extrapolated from the last poses. Returns `None` when no recent pose is known.
     pub fn pose(&self, tick: Tick, h: f64) -> Option<RigidState> {
-        let at = |t: Tick| self.known(t).and_then(|d| d.pose);
+        let at = |t: Tick| self.received_pose(t);
         if let Some(pose) = at(tick) {
             return Some(pose);
         }

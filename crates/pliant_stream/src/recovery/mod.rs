@@ -20,6 +20,9 @@ pub use passivity::PassivityGuard;
 pub use pose_blend::PoseBlend;
 pub use receiver::{Arrival, Receiver, RepairCounts, VisualGrab};
 
+use nalgebra::Vector3;
+use pliant_modal::{ContactState, Frame};
+
 pub use crate::prediction::HandState;
 use crate::state::{State, Tick};
 
@@ -30,8 +33,16 @@ use crate::state::{State, Tick};
 /// resulting difference out of the visual state.
 pub trait Recovery: Send + Sync {
     /// Takes `state` as the true state after `tick`. `load` holds the modal forces that the
-    /// reactions do not explain. `hands` holds the forces of the hands over the last step.
-    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], hands: &[HandState]);
+    /// reactions do not explain. `hands` holds the forces of the hands over the last step, and
+    /// `contacts` what the contacts of that step have left.
+    fn restart(
+        &mut self,
+        tick: Tick,
+        state: &State,
+        load: &[f64],
+        hands: &[HandState],
+        contacts: &ContactState,
+    );
 
     /// Steps to `tick`, which is one tick after the last. The step uses the data of `tick` if
     /// `history` has it, and a prediction otherwise.
@@ -52,6 +63,22 @@ pub trait Recovery: Send + Sync {
     /// none.
     fn load(&self) -> &[f64] {
         &[]
+    }
+
+    /// The rigid frame of a free body, if the policy steps it where no pose has arrived.
+    fn frame(&self) -> Option<&Frame> {
+        None
+    }
+
+    /// What the contacts of the last step have left, if the policy steps them.
+    fn contacts(&self) -> Option<&ContactState> {
+        None
+    }
+
+    /// Sum of the contact forces of the last step (N), and their torque about the center of mass
+    /// (N m), world axes, as far as the policy knows them.
+    fn contact_push(&self) -> [Vector3<f64>; 2] {
+        [Vector3::zeros(); 2]
     }
 
     /// The hands of the last step, as far as the policy knows them.

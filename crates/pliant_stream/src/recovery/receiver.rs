@@ -3,13 +3,12 @@
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use pliant_modal::{ModalModel, StepSettings};
+use pliant_modal::{ContactState, ModalModel, StepSettings};
 
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
 };
 use super::{Forecast, PassivityGuard, PoseBlend};
-use crate::StreamError;
 use crate::codec::checksum::checksum;
 use crate::codec::quantization::Quanta;
 use crate::newmark::Newmark;
@@ -17,6 +16,7 @@ use crate::prediction::{HandState, Ring};
 use crate::replica::{self, Replica};
 use crate::state::{GrabKey, GrabState, RigidState, State, Tick, UserId};
 use crate::wire::{SnapshotBytes, TickFrame};
+use crate::{StreamError, Surroundings};
 
 /// Number of disagreeing checksums in a row before the receiver wants a snapshot. A slice or a
 /// repair may correct a single disagreement.
@@ -134,6 +134,22 @@ impl Receiver {
         config: &RecoveryConfig,
         snapshot: &SnapshotBytes,
     ) -> Result<Self, StreamError> {
+        Self::among(&Surroundings::default(), model, settings, modes, newmark, config, snapshot)
+    }
+
+    /// As [`Receiver::new`], for a body that may touch what stands around it.
+    ///
+    /// # Errors
+    /// Returns also the errors of [`Surroundings::check`].
+    pub fn among(
+        around: &Surroundings,
+        model: Arc<ModalModel>,
+        settings: StepSettings,
+        modes: usize,
+        newmark: Newmark,
+        config: &RecoveryConfig,
+        snapshot: &SnapshotBytes,
+    ) -> Result<Self, StreamError> {
         config.check()?;
         newmark.check()?;
         let modes = modes.min(model.mode_count());
@@ -148,7 +164,9 @@ impl Receiver {
             Policy::None => (Box::new(integrating(Predict::Zero, false)), 1),
             Policy::Paper { predict, blend_ticks } => (Box::new(integrating(predict, true)), blend_ticks),
             Policy::ForceDriven { blend_ticks } => {
-                (Box::new(ForceDriven::new(replica()?, Forecast::new(newmark.h))), blend_ticks)
+                let mut replica = replica()?;
+                replica.set_surroundings(around)?;
+                (Box::new(ForceDriven::new(replica, Forecast::new(newmark.h))), blend_ticks)
             }
         };
         let guard = config.passive.then(|| {
@@ -185,8 +203,10 @@ impl Receiver {
             h: newmark.h,
             blend_ticks,
         };
-        receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &hands_of(snapshot));
+        receiver.take(snapshot);
         receiver.visual.clone_from(receiver.policy.confirmed());
+        receiver.frame = receiver.best_pose();
+        receiver.pose = receiver.frame;
         Ok(receiver)
     }
 
@@ -208,6 +228,16 @@ impl Receiver {
     /// The best estimate of the rigid pose at the current tick. `None` if the body is not free.
     pub(crate) fn frame(&self) -> Option<RigidState> {
         self.frame
+    }
+
+    /// What the contacts of the confirmed tick have left.
+    pub(crate) fn contacts(&self) -> Option<&ContactState> {
+        self.policy.contacts()
+    }
+
+    /// The contact forces of the confirmed tick, see [`Recovery::contact_push`].
+    pub(crate) fn contact_push(&self) -> [Vector3<f64>; 2] {
+        self.policy.contact_push()
     }
 
     pub(crate) fn hands(&self) -> &[HandState] {
@@ -343,11 +373,12 @@ impl Receiver {
             return;
         }
         self.remember_before();
-        self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &hands_of(snapshot));
+        self.take(snapshot);
         if self.history.highest() > snapshot.tick + HISTORY as u64 {
             // A frame carried a tick from far in the future, so current data would look too old to
             // be used.
             self.history = History::new(snapshot.tick);
+            self.history.take_pose(snapshot.tick, snapshot.pose);
             self.tick = self.tick.min(snapshot.tick);
         }
         let distance = self.tick.abs_diff(snapshot.tick);
@@ -386,12 +417,41 @@ impl Receiver {
         let rest = State {
             q: self.before.q.clone(),
             z: self.before.z.clone(),
+            frame: self.before.frame,
             ..State::zero(self.before.modes(), false)
         };
         let hands = self.policy.hands().to_vec();
-        self.policy.restart(tick, &rest, &[], &hands);
+        let contacts = self.policy.contacts().cloned().unwrap_or_default();
+        let pose = self.best_pose();
+        self.policy.restart(tick, &rest, &[], &hands, &contacts);
+        self.history.take_pose(tick, pose);
         self.tick = tick;
         self.show();
+    }
+
+    /// Takes over the state of a snapshot.
+    fn take(&mut self, snapshot: &SnapshotBytes) {
+        let frame = snapshot.pose.and_then(|pose| pose.frame(self.replica.model()));
+        let state = State {
+            q: snapshot.q.clone(),
+            v: snapshot.v.clone(),
+            a: snapshot.a.clone(),
+            z: snapshot.z.clone(),
+            frame: frame.unwrap_or(self.policy.confirmed().frame),
+            ..State::default()
+        };
+        let hands = hands_of(snapshot);
+        self.policy.restart(snapshot.tick, &state, &snapshot.load, &hands, &snapshot.contacts);
+        self.history.take_pose(snapshot.tick, snapshot.pose);
+    }
+
+    /// The best estimate of the rigid pose at the current tick.
+    fn best_pose(&self) -> Option<RigidState> {
+        if !self.free {
+            return None;
+        }
+        let stepped = self.policy.frame().map(|frame| RigidState::of_frame(self.replica.model(), frame));
+        stepped.or_else(|| self.history.pose(self.tick, self.h))
     }
 
     /// If the last visual pose was a prediction and a better pose is known, blends the difference
@@ -399,7 +459,7 @@ impl Receiver {
     fn correct_pose(&mut self) {
         self.pose_blend.advance();
         let Some(guess) = self.frame else { return };
-        if let Some(known) = self.history.pose(self.tick, self.h).filter(|known| *known != guess) {
+        if let Some(known) = self.best_pose().filter(|known| *known != guess) {
             self.pose_blend.add(&guess, &known);
         }
     }
@@ -440,7 +500,7 @@ impl Receiver {
                 }
             }
         }
-        self.frame = if self.free { self.history.pose(self.tick, self.h).or(self.frame) } else { None };
+        self.frame = self.best_pose().or(self.frame);
         self.pose = self.frame.map(|pose| self.pose_blend.apply(&pose));
         if self.policy.driven_by_reactions() {
             let forecast = self.forecast;
@@ -536,16 +596,6 @@ fn hands_of(snapshot: &SnapshotBytes) -> Vec<HandState> {
         HandState::of_mean(GrabKey { user: UserId(user), grab }, mean.into())
     };
     snapshot.means.iter().map(of).collect()
-}
-
-fn state_of(snapshot: &SnapshotBytes) -> State {
-    State {
-        q: snapshot.q.clone(),
-        v: snapshot.v.clone(),
-        a: snapshot.a.clone(),
-        z: snapshot.z.clone(),
-        ..State::default()
-    }
 }
 
 #[cfg(test)]

@@ -36,7 +36,7 @@ pub enum DisconnectReason {
     /// The path's datagrams are too small, see [`MIN_DATAGRAM`](super::MIN_DATAGRAM).
     #[error("datagrams too small")]
     SmallDatagrams,
-    /// The two peers have different bodies, step settings or steps.
+    /// The two peers have different bodies, step settings, surroundings or steps.
     #[error("other bodies or settings")]
     SceneMismatch,
     /// The host asks for a token, and none was presented.

@@ -10,10 +10,11 @@ use super::download::Download;
 use super::guest_body::StreamedBody;
 use super::guest_config::{GuestEvent, GuestSessionConfig};
 use super::guest_hands::LocalGrab;
+use super::host_peer::impulse_budget;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
-use crate::link::{Events, Link, micros};
+use crate::link::{Budget, Events, Link, micros};
 use crate::newmark::Newmark;
 use crate::state::{BodyId, PeerId, UserId, UserInfo, UserLinkInfo};
 use crate::wire::{
@@ -55,6 +56,7 @@ pub struct GuestSession {
     pub(super) grabs: BTreeMap<u16, LocalGrab>,
     pub(super) next_grab: u16,
     pub(super) input: u32,
+    pub(super) impulse_budget: Budget,
     out: VecDeque<Output>,
     events: Events<GuestEvent>,
     clock: ClockEstimate,
@@ -93,6 +95,7 @@ impl GuestSession {
             grabs: BTreeMap::new(),
             next_grab: 0,
             input: 0,
+            impulse_budget: impulse_budget(),
             out: VecDeque::new(),
             events: Events::default(),
             clock: ClockEstimate::default(),
@@ -294,7 +297,7 @@ impl GuestSession {
                 self.announced.insert(info.hash);
                 let model = self.models.get(&info.hash).cloned();
                 let mut view =
-                    StreamedBody::new(info, self.newmark, self.config.recovery, self.config.predict_own_hand);
+                    StreamedBody::new(info, self.newmark, self.config.recovery, self.config.predict_hand);
                 if let Some(model) = model {
                     view.set_model(model);
                 }

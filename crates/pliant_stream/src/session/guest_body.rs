@@ -158,7 +158,7 @@ impl StreamedBody {
     ///
     /// The result is `None` unless the guest holds the body or the copy still fades to the
     /// confirmed state. The copy needs [`Policy::ForceDriven`] and
-    /// [`crate::GuestSessionConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`]
+    /// [`crate::GuestSessionConfig::predict_hand`]. Show it instead of [`StreamedBody::visual`]
     /// when it exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.predicted.as_ref().filter(|predicted| predicted.is_active())
@@ -288,8 +288,9 @@ impl StreamedBody {
         }
         let (Some(model), Some(snapshot)) = (&self.model, &self.snapshot) else { return false };
         let modes = snapshot.q.len();
+        let (around, settings) = (&self.info.around, self.info.settings);
         let made =
-            Receiver::new(model.clone(), self.info.settings, modes, self.newmark, &self.config, snapshot);
+            Receiver::among(around, model.clone(), settings, modes, self.newmark, &self.config, snapshot);
         let Ok(mut receiver) = made else { return false };
         for frame in self.waiting.drain(..) {
             if frame.tick > snapshot.tick {
@@ -297,7 +298,8 @@ impl StreamedBody {
             }
         }
         if let (Policy::ForceDriven { blend_ticks }, true) = (self.config.policy, self.predicts)
-            && let Ok(replica) = Replica::new(model.clone(), self.info.settings, modes, self.newmark.h)
+            && let Ok(mut replica) = Replica::new(model.clone(), settings, modes, self.newmark.h)
+            && replica.set_surroundings(around).is_ok()
         {
             let mut predicted = PredictedHand::new(replica, blend_ticks);
             if let Some(before) = self.predicted.take() {

@@ -22,7 +22,7 @@ pub struct GuestSessionConfig {
     /// Steps a newer copy of each body that this guest holds, in which the guest's own hands do not
     /// wait for the round trip; see
     /// [`StreamedBody::predicted_hand`](super::StreamedBody::predicted_hand). Default: true.
-    pub predict_own_hand: bool,
+    pub predict_hand: bool,
     /// Largest number of bytes of models that a host may send, counting complete models and
     /// downloads in progress. The guest leaves a host that exceeds the limit, with
     /// [`DisconnectReason::Full`]. Models that the application added itself do not count. Default:
@@ -43,7 +43,7 @@ impl Default for GuestSessionConfig {
             name: "guest".to_owned(),
             recovery: RecoveryConfig::default(),
             modes: None,
-            predict_own_hand: true,
+            predict_hand: true,
             model_bytes: 1 << 30,
             models_apart: false,
             idle_timeout: Duration::from_secs(10),

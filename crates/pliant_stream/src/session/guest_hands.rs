@@ -112,6 +112,39 @@ impl GuestSession {
         }
     }
 
+    /// Applies an impulse (N s, world axes) to a surface vertex of a body at the host's next tick.
+    ///
+    /// It brings the body at most [`MAX_IMPULSE_SPEED`](crate::MAX_IMPULSE_SPEED), and is seen here
+    /// a round trip later. The host may ignore it, and does so if this user may only watch.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`] for an
+    /// unknown body, [`StreamError::NotFinite`] for an impulse out of range, and
+    /// [`StreamError::Full`] beyond 60 impulses a second (120 at once).
+    pub fn apply_impulse(
+        &mut self,
+        now: Duration,
+        body: BodyId,
+        vertex: u32,
+        impulse: [f64; 3],
+    ) -> Result<(), StreamError> {
+        if self.user().is_none() {
+            let (what, state) = ("apply_impulse", "not in");
+            return Err(StreamError::State { what, state, needed: "the host's welcome" });
+        }
+        if !self.bodies.contains_key(&body) {
+            return Err(StreamError::UnknownBody(body));
+        }
+        if !in_range(&impulse) {
+            return Err(StreamError::NotFinite { what: "impulse" });
+        }
+        if !self.impulse_budget.spend(now, 1.0) {
+            return Err(StreamError::Full { what: "impulses", limit: super::host_peer::IMPULSES_AT_ONCE });
+        }
+        self.message(&GuestMessage::Impulse { body: body.0, vertex, impulse });
+        Ok(())
+    }
+
     /// Iterates over the guest's grabs: number and body.
     pub fn grabs(&self) -> impl Iterator<Item = (u16, BodyId)> {
         self.grabs.iter().map(|(k, g)| (*k, g.body))

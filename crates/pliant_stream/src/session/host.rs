@@ -11,19 +11,19 @@ use super::host_config::{HostEvent, HostSessionConfig};
 use super::host_peer::{AnnouncedGrab, GuestPeer, MAX_GUEST_GRABS, Standing};
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
-use crate::StreamError;
 use crate::codec::encoder::Encoder;
 use crate::link::Events;
 use crate::newmark::Newmark;
 use crate::state::{
-    BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo, next_free,
+    BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo, capped_impulse, next_free,
 };
 use crate::wire::{
     BodyInfo, Datagram, GuestMessage, HostMessage, MAX_NAME, PROTOCOL_VERSION, StreamSubscription,
 };
+use crate::{StreamError, Surroundings};
 
 /// Encoders of a body that are kept while nobody receives their stream. A guest that changes its
-/// wish again and again costs no new one each time, with the patches of all hands.
+/// subscription again and again costs no new one each time, with the patches of all hands.
 const SPARE_ENCODERS: usize = 8;
 
 /// Key of an encoder: the subscription and the datagram size in bytes.
@@ -38,9 +38,9 @@ pub(super) struct HostBody {
     pub(super) hash: [u8; 32],
     pub(super) settings: StepSettings,
     pub(super) placement: Option<Placement>,
+    pub(super) around: Surroundings,
     pub(super) last: Option<Tick>,
     pub(super) resting: bool,
-    pub(super) reminded: Duration,
     /// The visible amplitudes of the modes, for the encoders.
     pub(super) visible: OnceLock<Vec<f64>>,
     /// One encoder per subscription and datagram size, with some that nobody receives any more.
@@ -71,6 +71,7 @@ impl HostBody {
             modes: Encoder::modes_for(&guest.subscription?, self.model.mode_count(), guest.link.max_datagram)
                 as u16,
             settings: self.settings,
+            around: self.around.clone(),
         })
     }
 }
@@ -358,6 +359,18 @@ impl HostSession {
             Ok(GuestMessage::Interest { body, modes }) if p.user().is_some() => {
                 if p.interest_budget.spend(now, 1.0) {
                     self.set_interest(peer, BodyId(body), modes);
+                }
+                return;
+            }
+            // A game may strike many bodies in a frame, which is no breach of the protocol either.
+            Ok(GuestMessage::Impulse { body, vertex, impulse }) if p.user().is_some() => {
+                let body = BodyId(body);
+                let model = self.bodies.get(&body).map(|b| &b.model);
+                let fits = p.role == Role::Hold && p.impulse_budget.spend(now, 1.0);
+                let on = |model: &&Arc<ModalModel>| (vertex as usize) < model.surface().positions().len();
+                if let (Some(user), Some(model), true) = (p.user(), model.filter(on), fits) {
+                    let impulse = capped_impulse(model, impulse);
+                    self.event(HostEvent::Impulse { user, body, vertex, impulse });
                 }
                 return;
             }

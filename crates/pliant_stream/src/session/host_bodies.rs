@@ -2,16 +2,15 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
-use std::time::Duration;
 
 use pliant_modal::{ModalModel, StepSettings};
 
 use super::host::{HostBody, HostSession};
 use super::host_config::HostEvent;
 use super::host_peer::Transfer;
-use crate::StreamError;
 use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId, Placement};
 use crate::wire::HostMessage;
+use crate::{StreamError, Surroundings};
 
 impl HostSession {
     /// Adds a body to the session and announces it to the guests at once.
@@ -67,9 +66,9 @@ impl HostSession {
             model,
             settings,
             placement: None,
+            around: Surroundings::default(),
             last: None,
             resting: false,
-            reminded: Duration::ZERO,
             visible: OnceLock::new(),
             streams: BTreeMap::new(),
         };
@@ -92,10 +91,37 @@ impl HostSession {
     pub fn set_settings(&mut self, body: BodyId, settings: StepSettings) -> Result<(), StreamError> {
         settings.check().map_err(|e| StreamError::Model(e.to_string()))?;
         let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
-        if entry.settings == settings {
-            return Ok(());
+        if entry.settings != settings {
+            entry.settings = settings;
+            self.announce_change(body);
         }
-        entry.settings = settings;
+        Ok(())
+    }
+
+    /// Tells the guests what stands still around a free body, so that their copies touch it. From
+    /// the next tick on the contacts of the body with these obstacles are no load that is sent.
+    ///
+    /// The obstacles must be those that the host's body touches. Other contacts, as with other
+    /// bodies and with what moves, reach the guests as a load. The same holds for anchored bodies,
+    /// for guests that take fewer modes than the model has, and for streams of accelerations. As
+    /// with [`HostSession::set_settings`], every change restarts the streams of the body.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::UnknownBody`] for an unknown body, and the errors of
+    /// [`Surroundings::check`]. The old surroundings then stay.
+    pub fn set_surroundings(&mut self, body: BodyId, around: Surroundings) -> Result<(), StreamError> {
+        around.check()?;
+        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
+        if entry.around != around {
+            entry.around = around;
+            self.announce_change(body);
+        }
+        Ok(())
+    }
+
+    /// Tells all guests that have a body what has changed of it, and restarts its streams.
+    fn announce_change(&mut self, body: BodyId) {
+        let Some(entry) = self.bodies.get_mut(&body) else { return };
         entry.streams.clear();
         let entry = &*entry;
         for p in self.peers.values_mut().filter(|p| p.announced.contains(&body)) {
@@ -103,7 +129,6 @@ impl HostSession {
             p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
             p.due.insert(body);
         }
-        Ok(())
     }
 
     /// Places an anchored body in the host's world, and notifies the guests that have the body.

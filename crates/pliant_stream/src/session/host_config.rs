@@ -119,6 +119,18 @@ pub enum HostEvent {
         /// Position of the hand, world, m.
         target: [f64; 3],
     },
+    /// A guest's impulse. The application applies it at the next tick, or drops it.
+    Impulse {
+        /// The user.
+        user: UserId,
+        /// The body.
+        body: BodyId,
+        /// Surface vertex, which exists.
+        vertex: u32,
+        /// The impulse, N s, world axes. It changes the speed of the whole body by at most
+        /// [`MAX_IMPULSE_SPEED`](crate::MAX_IMPULSE_SPEED).
+        impulse: [f64; 3],
+    },
     /// A grab ended.
     GrabEnded {
         /// Identifies the grab.

@@ -15,6 +15,14 @@ pub(crate) const MAX_GUEST_GRABS: usize = 16;
 /// Largest number of queued resends for one guest.
 const MAX_RESENDS: usize = 512;
 
+/// Largest number of impulses of one guest at once.
+pub(super) const IMPULSES_AT_ONCE: usize = 120;
+
+/// The budget of impulses of one guest, which guest and host both keep: 60 a second.
+pub(super) fn impulse_budget() -> Budget {
+    Budget::new(60.0, IMPULSES_AT_ONCE as f64)
+}
+
 /// Stage of a guest's join.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Standing {
@@ -71,6 +79,8 @@ pub(crate) struct GuestPeer {
     pub(crate) target_budget: Budget,
     /// Budget for changes of interest.
     pub(crate) interest_budget: Budget,
+    /// Budget of impulses.
+    pub(crate) impulse_budget: Budget,
     pub(crate) regulator: Regulator,
 }
 
@@ -98,6 +108,7 @@ impl GuestPeer {
             target_budget: Budget::new(MAX_GUEST_GRABS as f64 * 240.0, 1024.0),
             // One for each of the most bodies that a session may have.
             interest_budget: Budget::new(100.0, MAX_BODIES as f64),
+            impulse_budget: impulse_budget(),
             regulator: Regulator::default(),
         }
     }

@@ -12,9 +12,6 @@ use crate::codec::quantization::Quanta;
 use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
 use crate::wire::WIDE_LIMIT;
 
-/// Interval at which guests are reminded of a resting body.
-const REMINDER: Duration = Duration::from_secs(1);
-
 /// Delays, as shares of a step, after which a tick that begins or ends a grab is sent again. Such a
 /// tick cannot be extrapolated, and its repeat arrives only with the next tick.
 const EVENT_RESENDS: [f64; 2] = [0.3, 0.65];
@@ -48,18 +45,13 @@ impl HostSession {
         // A snapshot is due for guests that wait for the state and have the model. A guest that is
         // still downloading the model waits, without cost to the others.
         let is_due = |p: &GuestPeer| p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == hash);
-        let reminds = stays && now.saturating_sub(entry.reminded) >= REMINDER;
-        if reminds {
-            entry.reminded = now;
-        } else if stays && !self.peers.values().any(is_due) {
+        // Messages are reliable, so who has been told that the body rests need not be told again.
+        if stays && !self.peers.values().any(is_due) {
             return Ok(());
         }
         // After a gap in the ticks, or when the body falls asleep, all guests take the state anew.
         // Waking up continues from the state that all guests have, so only a new run begins.
         let anew = slept || (!follows && !woke && !stays);
-        if slept {
-            entry.reminded = now;
-        }
 
         let mut keys: BTreeSet<StreamKey> = BTreeSet::new();
         let mut takers: Vec<(PeerId, StreamKey, bool)> = Vec::new();
@@ -89,7 +81,7 @@ impl HostSession {
                         key.1,
                         visible,
                     );
-                    match made {
+                    match made.and_then(|encoder| encoder.among(&entry.around)) {
                         Ok(encoder) => {
                             self.encoders_made += 1;
                             e.insert(encoder.with_quantum(self.config.quantum))
@@ -129,7 +121,7 @@ impl HostSession {
                     p.queue_resend(due, body, state.tick);
                 }
             }
-            if due || *fresh || (reminds && p.streaming.contains(&body)) {
+            if due || *fresh {
                 p.due.remove(&body);
                 p.streaming.insert(body);
                 self.send_snapshot(peer, body);

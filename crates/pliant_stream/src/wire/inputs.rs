@@ -1,4 +1,4 @@
-//! Datagram between peers: the inputs of the sender's hands.
+//! Datagram between peers: the inputs of the sender's hands, and its impulses.
 
 use pliant_modal::GrabConfig;
 
@@ -12,6 +12,10 @@ use crate::state::{BodyId, GrabKey, Tick, UserId};
 pub(crate) const MAX_TICKS: usize = 16;
 /// Largest number of grabs of one user at one tick.
 pub(crate) const MAX_HELD: usize = 16;
+/// Largest number of impulses of one user at one tick.
+pub(crate) const MAX_IMPULSES: usize = 8;
+/// Bytes of one impulse.
+const IMPULSE_BYTES: usize = 18;
 /// Bytes of one grab without spring and damper.
 const HELD_BYTES: usize = 25;
 
@@ -80,13 +84,51 @@ impl HeldAt {
     }
 }
 
-/// All grabs of one user at one tick.
+/// An impulse at the beginning of one tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ImpulseAt {
+    /// The body.
+    pub body: BodyId,
+    /// The surface vertex.
+    pub vertex: u32,
+    /// The impulse, N s, world axes.
+    pub impulse: [f64; 3],
+}
+
+impl ImpulseAt {
+    /// Rounds the values as the wire format does.
+    pub(crate) fn rounded(mut self) -> Self {
+        self.impulse = self.impulse.map(|x| f64::from(x as f32));
+        self
+    }
+
+    fn encode(&self, w: &mut Writer) {
+        w.u16(self.body.0);
+        w.u32(self.vertex);
+        w.vector(self.impulse);
+    }
+
+    fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
+        let (body, vertex) = (BodyId(r.u16("impulse body")?), r.u32("impulse vertex")?);
+        Ok(Self { body, vertex, impulse: r.vector("impulse")? })
+    }
+}
+
+/// What one user does at one tick.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct InputTick {
     /// The tick.
     pub tick: Tick,
     /// The grabs, at most 16.
     pub held: Vec<HeldAt>,
+    /// The impulses, at most 8, in the order in which they act.
+    pub impulses: Vec<ImpulseAt>,
+}
+
+impl InputTick {
+    fn bytes(&self) -> usize {
+        8 + self.held.iter().map(HeldAt::bytes).sum::<usize>() + IMPULSE_BYTES * self.impulses.len()
+    }
 }
 
 /// Checksum of one body at a tick for which the sender knows all inputs.
@@ -118,8 +160,7 @@ pub struct Inputs {
 impl Inputs {
     /// Number of bytes of a datagram with these ticks.
     pub(crate) fn bytes(ticks: &[InputTick]) -> usize {
-        let tick = |t: &InputTick| 7 + t.held.iter().map(HeldAt::bytes).sum::<usize>();
-        3 + 6 + 2 + 1 + 1 + 12 + ticks.iter().map(tick).sum::<usize>()
+        3 + 6 + 2 + 1 + 1 + 12 + ticks.iter().map(InputTick::bytes).sum::<usize>()
     }
 
     /// Writes the inputs after a datagram header.
@@ -134,6 +175,9 @@ impl Inputs {
             let held = &t.held[..t.held.len().min(MAX_HELD)];
             w.u8(held.len() as u8);
             held.iter().for_each(|held| held.encode(w));
+            let impulses = &t.impulses[..t.impulses.len().min(MAX_IMPULSES)];
+            w.u8(impulses.len() as u8);
+            impulses.iter().for_each(|impulse| impulse.encode(w));
         }
         w.u8(u8::from(self.check.is_some()));
         if let Some(c) = self.check {
@@ -161,7 +205,10 @@ impl Inputs {
             for _ in 0..count {
                 held.push(HeldAt::decode(r)?);
             }
-            ticks.push(InputTick { tick, held });
+            let count = r.u8("impulse count")?;
+            bounded("impulse count", count, MAX_IMPULSES, "at most 8")?;
+            let impulses = (0..count).map(|_| ImpulseAt::decode(r)).collect::<Result<_, _>>()?;
+            ticks.push(InputTick { tick, held, impulses });
         }
         let flag = r.u8("check flag")?;
         bounded("check flag", flag, 1, "0 or 1")?;

@@ -1,12 +1,14 @@
 //! Reliable messages between host and guest: encoded with postcard and checked after decoding.
 
-use pliant_modal::{GrabConfig, StepSettings};
+use pliant_modal::{ContactState, GrabConfig, StepSettings};
 use serde::{Deserialize, Serialize};
 
 use super::{AccelerationCoding, WIDE_LIMIT};
-use crate::StreamError;
 use crate::session::{DisconnectReason, MAX_MESSAGE};
-use crate::state::{MAX_GRABS, MAX_MODES, Placement, TICK_LIMIT, UserInfo, UserLinkInfo, in_range};
+use crate::state::{
+    MAX_GRABS, MAX_MODES, Placement, RigidState, TICK_LIMIT, UserInfo, UserLinkInfo, in_range,
+};
+use crate::{StreamError, Surroundings};
 
 /// Longest name of a user or a body, bytes of UTF-8.
 pub(crate) const MAX_NAME: usize = 64;
@@ -51,6 +53,8 @@ pub struct BodyInfo {
     pub modes: u16,
     /// Step settings of the body at the host.
     pub settings: StepSettings,
+    /// What stands still around the body.
+    pub around: Surroundings,
 }
 
 /// The encoder's own copy of the receiver's state at a tick. A receiver that takes it has no error
@@ -74,6 +78,10 @@ pub struct SnapshotBytes {
     pub load: Vec<f64>,
     /// Mean force of each hand on the body over the last step, N, world axes: user, grab, force.
     pub means: Vec<(u16, u16, [f64; 3])>,
+    /// What the contacts of the last step have left for the next.
+    pub contacts: ContactState,
+    /// The rigid pose of a free body.
+    pub pose: Option<RigidState>,
     /// The body sleeps from this tick on.
     pub resting: bool,
 }
@@ -128,6 +136,15 @@ pub enum GuestMessage {
     Goodbye {
         /// The reason.
         reason: DisconnectReason,
+    },
+    /// An impulse on a body, at the host's next tick.
+    Impulse {
+        /// The body.
+        body: u16,
+        /// The surface vertex.
+        vertex: u32,
+        /// The impulse, N s, world axes.
+        impulse: [f64; 3],
     },
 }
 
@@ -275,6 +292,9 @@ impl GuestMessage {
                 check("target", in_range(target), format!("{target:?}"), "finite meters")?;
                 *hold = check_hold(*hold)?;
             }
+            Self::Impulse { impulse, .. } => {
+                check("impulse", in_range(impulse), format!("{impulse:?}"), "finite N s, at most 1e9")?;
+            }
             Self::GrabEnd { .. }
             | Self::SnapshotRequest { .. }
             | Self::Interest { .. }
@@ -311,6 +331,9 @@ impl HostMessage {
                 if let Err(error) = settings.check() {
                     check("settings", false, error, "settings in their ranges")?;
                 }
+                if let Err(error) = info.around.check() {
+                    check("surroundings", false, error, "at most 256 obstacles in their ranges")?;
+                }
             }
             Self::Snapshot(s) => {
                 check("snapshot tick", s.tick < TICK_LIMIT, s.tick, "below 2^48")?;
@@ -327,6 +350,7 @@ impl HostMessage {
                     && in_range(&s.v)
                     && in_range(&s.z);
                 let finite = finite && wide_range(&s.a) && wide_range(&s.load);
+                let finite = finite && s.contacts.is_valid() && s.pose.is_none_or(|pose| pose.is_valid());
                 check("snapshot", finite, "a number out of range", "finite numbers")?;
             }
             Self::BodyPlaced { placement, .. } => {

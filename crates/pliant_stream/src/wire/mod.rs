@@ -20,8 +20,8 @@ pub use datagram::{Clock, Datagram, Nack, NackRun, ReceiverReport, TargetEntry, 
 pub(crate) use datagram::{MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TARGETS};
 pub(crate) use frame::MAX_PARTS;
 pub use frame::{AccelerationCoding, Accelerations, FrameGrab, Repeat, RepeatGrab, TickFrame};
-pub use inputs::{HeldAt, InputTick, Inputs, StateCheck};
-pub(crate) use inputs::{MAX_HELD, MAX_TICKS};
+pub use inputs::{HeldAt, ImpulseAt, InputTick, Inputs, StateCheck};
+pub(crate) use inputs::{MAX_HELD, MAX_IMPULSES, MAX_TICKS};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
 pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, check_hold};
 pub(crate) use peer_message::{MAX_ADDRESS, MAX_PEERS};
@@ -29,4 +29,4 @@ pub use peer_message::{PeerBodyState, PeerFrame, PeerHandState, PeerMessage};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.
-pub const PROTOCOL_VERSION: u16 = 5;
+pub const PROTOCOL_VERSION: u16 = 7;

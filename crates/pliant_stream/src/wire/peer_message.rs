@@ -1,5 +1,6 @@
 //! Reliable messages between peers.
 
+use pliant_modal::ContactState;
 use serde::{Deserialize, Serialize};
 
 use super::message::{check, decode, encode, wide_range};
@@ -12,6 +13,9 @@ use crate::state::{MAX_MODES, TICK_LIMIT, in_range};
 pub(crate) const MAX_PEERS: usize = 64;
 /// Longest address at which a peer can be reached, bytes of UTF-8.
 pub(crate) const MAX_ADDRESS: usize = 512;
+
+/// Largest number of hands on a body: sixteen of each peer, as many as an input has.
+const MAX_HANDS: usize = (MAX_PEERS + 1) * 16;
 
 /// The rigid frame of a free body in a [`PeerBodyState`], world axes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -45,14 +49,25 @@ pub struct PeerBodyState {
     pub frame: Option<PeerFrame>,
     /// The hands on the body in the last step.
     pub pulls: Vec<PeerHandState>,
+    /// What the contacts of the last step have left for the next.
+    pub contacts: ContactState,
 }
 
 impl PeerBodyState {
+    /// The most bytes that this state takes in a message.
+    pub(crate) fn most_bytes(&self) -> usize {
+        let numbers = [&self.q, &self.v, &self.a, &self.z, &self.force].map(Vec::len);
+        // Twelve numbers of a hand and nine of a contact, with what names them.
+        256 + 8 * numbers.iter().sum::<usize>() + 104 * self.pulls.len() + 80 * self.contacts.memory.len()
+    }
+
     fn check(&self) -> Result<(), StreamError> {
         let modes = self.q.len();
         let equal = [&self.v, &self.a, &self.force].iter().all(|x| x.len() == modes) && modes <= MAX_MODES;
         let equal = equal && (self.z.is_empty() || self.z.len() == modes);
         check("state lengths", equal, modes, "the same for q, v, a, z and forces, at most 4096")?;
+        let hands = self.pulls.len();
+        check("state hands", hands <= MAX_HANDS, hands, "at most 1040")?;
         let frame = self.frame.is_none_or(|f| {
             let norm = f.orientation.iter().map(|x| x * x).sum::<f64>();
             [f.center, f.velocity, f.spin].iter().all(|x| in_range(x)) && (0.5..2.0).contains(&norm)
@@ -61,7 +76,8 @@ impl PeerBodyState {
         let sane = frame
             && [&self.q, &self.v, &self.z].iter().all(|x| in_range(x))
             && [&self.a, &self.force].iter().all(|x| wide_range(x))
-            && self.pulls.iter().all(hand);
+            && self.pulls.iter().all(hand)
+            && self.contacts.is_valid();
         check("state", sane, "a number out of range", "finite numbers")
     }
 }
@@ -110,13 +126,16 @@ pub enum PeerMessage {
     },
     /// Requests the receiver's state, because checks disagree or too many inputs are missing.
     StateRequest,
-    /// The state after a tick for which the sender knows all inputs.
+    /// The state after a tick for which the sender knows all inputs, in as many messages as it
+    /// needs.
     State {
         /// The tick after which the state holds.
         tick: u64,
         /// The tick that the sender has reached.
         now: u64,
-        /// All bodies, at most 1,024.
+        /// The next message brings more bodies of this state.
+        more: bool,
+        /// Bodies, at most 1,024.
         bodies: Vec<PeerBodyState>,
     },
     /// The last message.
@@ -124,6 +143,16 @@ pub enum PeerMessage {
         /// The reason.
         reason: DisconnectReason,
     },
+    /// With whom the sender is connected, for receivers that have lost one of them.
+    Others {
+        /// The peers, as numbers and addresses, at most 64.
+        others: Vec<(u16, String)>,
+    },
+}
+
+fn check_others(others: &[(u16, String)]) -> Result<(), StreamError> {
+    check("other peers", others.len() <= MAX_PEERS, others.len(), "at most 64")?;
+    others.iter().try_for_each(|(_, address)| check_address(address))
 }
 
 fn check_address(address: &str) -> Result<(), StreamError> {
@@ -149,10 +178,10 @@ impl PeerMessage {
             }
             Self::Welcome { user, others } => {
                 check("user", *user != 0, user, "1 or more")?;
-                check("other peers", others.len() <= MAX_PEERS, others.len(), "at most 64")?;
-                others.iter().try_for_each(|(_, address)| check_address(address))?;
+                check_others(others)?;
             }
-            Self::State { tick, now, bodies } => {
+            Self::Others { others } => check_others(others)?,
+            Self::State { tick, now, bodies, .. } => {
                 check("state tick", *tick.max(now) < TICK_LIMIT, tick.max(now), "below 2^48")?;
                 check("state bodies", bodies.len() <= MAX_BODIES, bodies.len(), "at most 1024")?;
                 bodies.iter().try_for_each(PeerBodyState::check)?;

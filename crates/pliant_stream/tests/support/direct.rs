@@ -1,13 +1,14 @@
 //! Sessions without links: each side receives at once what the other sends.
 
+use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::GrabConfig;
+use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
 use pliant_stream::wire::FrameGrab;
 use pliant_stream::{
     BodyId, Channel, GrabKey, GrabState, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig,
-    PeerId, RecoveryConfig, StepSettings, TickState, UserId,
+    PeerId, RecoveryConfig, StepSettings, Surroundings, TickState, UserId,
 };
 
 use super::bar;
@@ -92,11 +93,17 @@ pub fn random(state: &mut u64) -> u64 {
 
 /// Three peers without links. Each output goes directly to its receiver.
 pub fn peers(now: Duration) -> Vec<PeerSession> {
+    peers_of(now, &bar(12, 0.05), &Surroundings::default())
+}
+
+/// The same with another body, and with what stands around it.
+pub fn peers_of(now: Duration, model: &Arc<ModalModel>, around: &Surroundings) -> Vec<PeerSession> {
     let mut all: Vec<PeerSession> = (0..3)
         .map(|k| {
             let config = PeerSessionConfig { user: UserId(k + 1), ..Default::default() };
             let mut peer = PeerSession::new(config).unwrap();
-            peer.add_body(BODY, bar(12, 0.05), &StepSettings::default()).unwrap();
+            peer.add_body(BODY, model.clone(), &StepSettings::default()).unwrap();
+            peer.set_surroundings(BODY, around.clone()).unwrap();
             for other in (0..3).filter(|o| *o != k) {
                 peer.connect(now, PeerId(u64::from(other)), UserId(other + 1), 1200).unwrap();
             }

@@ -1,16 +1,59 @@
 //! Comparison of states, and states that are received and sent.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use super::{CHECK_TOLERANCE, MAX_MISSED, MAX_OUT, PeerSession};
 use crate::peer::config::PeerEvent;
 use crate::peer::inputs::WINDOW;
-use crate::peer::other::RemotePeer;
+use crate::peer::other::{PartialState, RemotePeer};
+use crate::session::MAX_MESSAGE;
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{InputTick, PeerBodyState, PeerMessage, StateCheck};
 
+/// Bytes of the bodies in one message. The rest of it is shorter than this leaves.
+const PART: usize = MAX_MESSAGE - 64;
+
 impl PeerSession {
-    pub(super) fn take_state(
+    /// Takes a message with a state. The state is taken with the last of its messages.
+    pub(super) fn take_part(
+        &mut self,
+        now: Duration,
+        peer: PeerId,
+        [tick, theirs]: [Tick; 2],
+        more: bool,
+        bodies: Vec<PeerBodyState>,
+    ) {
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        let Some(user) = other.user else { return };
+        let partial = other.partial.take().filter(|partial| partial.tick == tick);
+        // A joining peer has asked all peers by its hello. After that, a state is taken only on
+        // request and only from a lower number. A peer that could send a state at will could force
+        // any shape on any peer.
+        if self.started && !(other.asked_state && user < self.config.user) {
+            other.asked_state = false;
+            return;
+        }
+        let mut partial = partial.unwrap_or(PartialState { tick, bodies: BTreeMap::new() });
+        for body in bodies {
+            let own = self.bodies.get(&BodyId(body.body));
+            if own.is_some_and(|own| own.model().mode_count() == body.q.len()) {
+                partial.bodies.insert(body.body, body);
+            }
+        }
+        if more {
+            other.partial = Some(partial);
+            return;
+        }
+        other.asked_state = false;
+        if partial.bodies.len() != self.bodies.len() {
+            return other.link.reject();
+        }
+        let bodies: Vec<PeerBodyState> = partial.bodies.into_values().collect();
+        self.take_state(now, user, tick, theirs, &bodies);
+    }
+
+    fn take_state(
         &mut self,
         now: Duration,
         from: UserId,
@@ -29,7 +72,7 @@ impl PeerSession {
             }
             // This peer held nothing in the ticks before it joined.
             for t in tick + 1..=to {
-                self.inputs.put(self.config.user, InputTick { tick: t, held: Vec::new() });
+                self.inputs.put(self.config.user, InputTick { tick: t, ..Default::default() });
             }
         }
         for b in bodies {
@@ -97,13 +140,29 @@ impl PeerSession {
         if bodies.len() != self.bodies.len() {
             return;
         }
-        let state = PeerMessage::State { tick, now: self.tick, bodies };
+        let (mut parts, mut bytes) = (vec![Vec::new()], 0);
+        for body in bodies {
+            let more = body.most_bytes();
+            if bytes + more > PART && bytes > 0 {
+                parts.push(Vec::new());
+                bytes = 0;
+            }
+            bytes += more;
+            if let Some(part) = parts.last_mut() {
+                part.push(body);
+            }
+        }
+        let (count, reached) = (parts.len(), self.tick);
+        let state: Vec<PeerMessage> = (1..)
+            .zip(parts)
+            .map(|(k, bodies)| PeerMessage::State { tick, now: reached, more: k < count, bodies })
+            .collect();
         for peer in wanting {
             let Some(other) = self.others.get_mut(&peer) else { continue };
             // A peer that asks too often waits.
             if other.link.states.spend(now, 1.0) {
                 other.wants_state = false;
-                self.message(peer, &state);
+                state.iter().for_each(|part| self.message(peer, part));
             }
         }
     }

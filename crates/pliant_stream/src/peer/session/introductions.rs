@@ -1,0 +1,72 @@
+//! Introductions: a peer tells the others with whom it is connected.
+//!
+//! Two peers may lose each other while one of them comes back through a third, which is told of
+//! neither loss. Without its introduction the mesh would stay incomplete.
+
+use std::time::Duration;
+
+use super::{MAX_ADDRESS, MAX_PEERS, PeerEvent, PeerId, PeerMessage, PeerSession, UserId};
+use crate::StreamError;
+
+/// Shortest time between two lists that are sent.
+const TELL_EVERY: Duration = Duration::from_secs(2);
+/// Shortest time between two lists of one peer that are read. Messages may arrive in a bunch, but
+/// what a list tells is told again by the next one.
+const READ_EVERY: Duration = Duration::from_millis(500);
+
+/// What this peer tells of the others.
+#[derive(Debug, Default)]
+pub(super) struct Introductions {
+    list: Vec<(u16, String)>,
+    /// Whether somebody is on the list who was not when it was sent.
+    is_new: bool,
+    /// When the list may be sent again.
+    next: Duration,
+}
+
+impl PeerSession {
+    /// Sets with whom this peer is connected, as user numbers and addresses, at most 64. When
+    /// somebody has come, all peers in the session are told, at most every two seconds. Those who
+    /// have lost one of them get [`PeerEvent::Introduced`].
+    ///
+    /// # Errors
+    /// Returns [`StreamError::Config`] for an address of more than 512 bytes.
+    pub fn introduce(&mut self, others: &[(UserId, String)]) -> Result<(), StreamError> {
+        if let Some((_, address)) = others.iter().find(|(_, address)| address.len() > MAX_ADDRESS) {
+            let found = address.len().to_string();
+            return Err(StreamError::Config { what: "address", found, expected: "at most 512 bytes" });
+        }
+        let known = &mut self.introductions;
+        let others = others.iter().take(MAX_PEERS);
+        let list: Vec<(u16, String)> = others.map(|(user, address)| (user.0, address.clone())).collect();
+        known.is_new |= list.iter().any(|(user, _)| known.list.iter().all(|(before, _)| before != user));
+        known.list = list;
+        Ok(())
+    }
+
+    pub(super) fn tell_others(&mut self, now: Duration) {
+        let known = &mut self.introductions;
+        if !known.is_new || now < known.next {
+            return;
+        }
+        (known.is_new, known.next) = (false, now + TELL_EVERY);
+        let message = PeerMessage::Others { others: known.list.clone() };
+        let present: Vec<PeerId> =
+            self.others.iter().filter(|(_, other)| other.user.is_some()).map(|(&peer, _)| peer).collect();
+        present.into_iter().for_each(|peer| self.message(peer, &message));
+    }
+
+    pub(super) fn take_others(&mut self, now: Duration, peer: PeerId, others: Vec<(u16, String)>) {
+        let Some(other) = self.others.get_mut(&peer).filter(|other| other.user.is_some()) else { return };
+        if other.told_at.is_some_and(|at| now.saturating_sub(at) < READ_EVERY) {
+            return other.link.reject();
+        }
+        other.told_at = Some(now);
+        let others = others.into_iter().map(|(user, address)| (UserId(user), address));
+        let others: Vec<_> =
+            others.filter(|(user, _)| *user != UserId::HOST && !self.is_taken(*user)).collect();
+        if !others.is_empty() {
+            self.event(PeerEvent::Introduced { peer, others });
+        }
+    }
+}
