@@ -52,9 +52,15 @@ pub enum BodyError {
     /// its model is not loaded yet.
     #[error("the impulse was refused: this entity is no body, or its model is not there yet")]
     NoBody,
-    /// The body of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is remote.
-    #[error("the impulse was refused: this body is driven remotely and is not stepped here")]
+    /// The body of a [`Push`](crate::Push) is remote.
+    #[error("the push was refused: this body is driven remotely and is not stepped here")]
     NotLocal,
+    /// Who drives the body, such as a session, did not take an [`Impulse`](crate::Impulse).
+    #[error("the impulse was refused: {why}")]
+    NotTaken {
+        /// The reason.
+        why: String,
+    },
     /// The body of a [`SurfaceAnchor`](crate::SurfaceAnchor) does not exist or was despawned.
     #[error("there is no body whose surface this entity could follow; it stays where it is")]
     NoSurface,

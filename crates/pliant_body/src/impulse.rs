@@ -9,16 +9,20 @@ use crate::{BodyError, BodyState, Driven, step::Refusals};
 ///
 /// Write the message with a `MessageWriter<Impulse>` or `Commands::write_message`. The next tick
 /// applies it in [`PliantSystems::Input`](crate::PliantSystems::Input) and wakes a resting body.
-/// Impulses of one tick add up. They act only on a body that this app steps. A session does not
-/// transmit impulses: an impulse that is written on a guest reaches no other peer.
+/// Impulses of one tick add up.
+///
+/// An impulse on a body that is [`Driven::Remote`] is left to who drives it. A session takes it: a
+/// guest's acts at the host's next tick, where its user may hold the body, and a peer's at all
+/// peers alike. It changes the speed of the whole body by at most 100 m/s, and is limited in
+/// number. A host's own impulses have no limit.
 ///
 /// On an entity of scale `s` the body's world is `s` times as large in lengths and forces, and its
 /// mass stays the same. An impulse of `J` N s changes `mass x velocity`, both measured in the
 /// entity's world, by `J`.
 ///
 /// [`BodyRefused`](crate::BodyRefused), with the entity in `body`, reports an impulse with NaN or
-/// infinity, a vertex or an entity that does not exist, a body that is [`Driven::Remote`], and an
-/// impulse that makes the velocity overflow.
+/// infinity, a vertex or an entity that does not exist, an impulse that makes the velocity
+/// overflow, and one that a session does not take.
 ///
 /// ```
 /// # use bevy::{math::DVec3, prelude::*};
@@ -41,7 +45,8 @@ pub struct Impulse {
 /// A force at one vertex of a body for one tick.
 ///
 /// A force that is written in every tick acts continuously. Forces are applied, scaled and refused
-/// like an [`Impulse`], and forces of one tick add up. Over a tick of `h` s a force adds an impulse
+/// like an [`Impulse`], and forces of one tick add up. No session takes them: on a body that is
+/// [`Driven::Remote`] they are refused. Over a tick of `h` s a force adds an impulse
 /// of `force x h` N s.
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
@@ -61,12 +66,14 @@ pub(crate) fn hit_bodies(
     mut refusals: Refusals,
     mut bodies: Query<(NameOrEntity, &Driven, &mut BodyState)>,
 ) {
-    let mut hit = |entity: Entity, apply: &dyn Fn(&mut Body, f64) -> Result<(), StepError>| {
+    let mut hit = |entity, is_push: bool, apply: &dyn Fn(&mut Body, f64) -> Result<(), StepError>| {
         let Ok((name, driven, mut state)) = bodies.get_mut(entity) else {
             return refusals.report(&entity, entity, BodyError::NoBody);
         };
-        if *driven != Driven::Local {
-            return refusals.report(&name, entity, BodyError::NotLocal);
+        match *driven {
+            Driven::Local => {}
+            Driven::Remote if is_push => return refusals.report(&name, entity, BodyError::NotLocal),
+            Driven::Remote => return,
         }
         let scale = state.scale;
         // A refused impulse or force does not wake the body.
@@ -76,9 +83,9 @@ pub(crate) fn hit_bodies(
         }
     };
     for &Impulse { body, vertex, impulse } in impulses.read() {
-        hit(body, &|body, scale| body.apply_impulse(vertex, (impulse / scale).into()));
+        hit(body, false, &|body, scale| body.apply_impulse(vertex, (impulse / scale).into()));
     }
     for &Push { body, vertex, force } in pushes.read() {
-        hit(body, &|body, scale| body.push(vertex, (force / scale).into()));
+        hit(body, true, &|body, scale| body.push(vertex, (force / scale).into()));
     }
 }

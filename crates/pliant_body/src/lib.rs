@@ -67,6 +67,7 @@ mod riding;
 mod saved;
 mod step;
 mod surface_anchor;
+mod surroundings;
 #[cfg(test)]
 mod tests;
 mod visual;
@@ -81,8 +82,8 @@ use bevy::{
 pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 #[cfg(feature = "bake")]
 pub use bake::{
-    ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeBodyError, BakeFailed, BakePlugin,
-    BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage, Bakery,
+    ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeBodyError, BakeExtrasError, BakeFailed,
+    BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage, Bakery,
 };
 pub use body::{BodyReady, BodyState, Driven, ModalBody, ModalBodyTemplate, NoPointerGrab};
 #[cfg(feature = "render")]
@@ -104,6 +105,7 @@ pub use riding::RidingPlugin;
 pub use saved::SavedState;
 pub use step::PliantTick;
 pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
+pub use surroundings::FixedObstacles;
 pub use visual::{Pose, VisualState};
 
 /// Diagnostic: time of one tick's steps of all awake bodies, ms.

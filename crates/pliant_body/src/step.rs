@@ -8,9 +8,10 @@ use bevy::{
     math::{DQuat, DVec3},
     platform::time::Instant,
     prelude::*,
+    tasks::ComputeTaskPool,
 };
 use pliant_modal::{
-    Body, BodyConfig, GrabConfig, Islands, ModalModel, Patch, Probe, StepError, Together, Touched,
+    Body, BodyConfig, Elasticity, GrabConfig, Islands, ModalModel, Patch, Probe, StepError, Together, Touched,
 };
 
 use crate::{
@@ -358,7 +359,7 @@ pub(crate) fn step_bodies(
     let traits: Vec<_> = all.iter().map(|(.., state)| (state.layers, state.scale)).collect();
     let mut together: Vec<Together<'_>> = Vec::with_capacity(all.len());
     for (name, _, state) in &mut all {
-        let resting = state.resting;
+        let (resting, layers) = (state.resting, state.layers);
         // A resting body has not changed as long as nothing wakes it.
         let body = &mut state.bypass_change_detection().body;
         // The running configuration is the base, because the component's fields may have been
@@ -369,6 +370,7 @@ pub(crate) fn step_bodies(
         };
         let mut member = Together::new(name.entity.to_bits(), body);
         (member.resting, member.error) = (resting, lengthened.err());
+        member.touches = probed || layers.is_some();
         together.push(member);
     }
     let may_touch = |a: usize, b: usize| {
@@ -378,7 +380,7 @@ pub(crate) fn step_bodies(
         scale == of_other && memberships & other[1] != 0 && other[0] & filters != 0
     };
     let may_probe = |probe: usize, body: usize| held[probe].1 == traits[body].1;
-    islands.step_with(&mut together, &mut taken, step, may_touch, may_probe);
+    islands.step_by(&mut together, &mut taken, step, may_touch, may_probe, on_all_threads);
     let results: Vec<_> = together.into_iter().map(|member| (member.resting, member.error)).collect();
     for ((entity, _), probe) in held.drain(..).zip(taken) {
         if let Ok((.., mut state)) = probes.get_mut(entity) {
@@ -410,6 +412,35 @@ pub(crate) fn step_bodies(
     diagnostics.add_measurement(&AWAKE_BODIES, || stepped as f64);
     if stepped > 0 {
         diagnostics.add_measurement(&STEP_TIME, || start.elapsed().as_secs_f64() * 1e3);
+    }
+}
+
+/// Steps bodies on the threads of the compute pool, where there is more work than handing it out.
+fn on_all_threads<'a>(bodies: &mut [Together<'a>], step: fn(&mut Together<'a>)) {
+    // In steps of a linear body of 20 modes, which take about half a microsecond.
+    let work = |together: &Together<'_>| match together.body.config().settings.elasticity {
+        Elasticity::Linear => 1 + together.body.mode_count() / 20,
+        Elasticity::Reduced => 300,
+    };
+    let work: usize = bodies.iter().filter(|body| !body.resting).map(work).sum();
+    batches(bodies, work >= 200, |batch| batch.iter_mut().for_each(step));
+}
+
+/// Calls `run` for parts of `items`: for all of them at once if it is not `worth` handing out.
+pub(crate) fn batches<T: Send>(items: &mut [T], worth: bool, run: impl Fn(&mut [T]) + Sync) {
+    match ComputeTaskPool::try_get() {
+        Some(pool) if worth && items.len() > 1 => {
+            // Some parts for each thread, since they are not equally long. The calling thread works
+            // too.
+            let size = items.len().div_ceil(4 * (pool.thread_num() + 1));
+            pool.scope(|scope| {
+                for part in items.chunks_mut(size) {
+                    let run = &run;
+                    scope.spawn(async move { run(part) });
+                }
+            });
+        }
+        _ => run(items),
     }
 }
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bevy::{ecs::entity::MapEntities, math::DVec3, prelude::*};
 use nalgebra::Vector3;
-use pliant_body::{BodyError, BodyRefused, BodyState, Driven, ProbeState, TouchProbe};
+use pliant_body::{BodyError, BodyRefused, BodyState, Driven, FixedObstacles, ProbeState, TouchProbe};
 use pliant_modal::{self as modal, StepError};
 
 use crate::obstacle::{ContactLayers, Motion, Nothing};
@@ -132,6 +132,20 @@ pub(crate) fn forget_body(
             state.wake();
         }
     }
+}
+
+/// Fills in the obstacles that stand still, for who steps a body elsewhere.
+pub(crate) fn tell_fixed(
+    added: On<Insert, FixedObstacles>,
+    obstacles: Query<(&Motion, Option<&ContactLayers>)>,
+    mut bodies: Query<(&mut FixedObstacles, &BodyState, Option<&ContactLayers>, Option<&BodyFriction>)>,
+) {
+    let Ok((mut told, state, layers, friction)) = bodies.get_mut(added.entity) else { return };
+    let layers = layers.copied().unwrap_or_default();
+    let touches = |other: Option<&ContactLayers>| layers.touch(other.copied().unwrap_or_default());
+    let near = obstacles.iter().filter(|(motion, other)| motion.sound && touches(*other));
+    told.obstacles = near.filter_map(|(motion, _)| motion.obstacle(state.scale()).fixed()).collect();
+    told.friction = friction.copied().unwrap_or_default().0;
 }
 
 type Bodies<'w, 's> = Query<

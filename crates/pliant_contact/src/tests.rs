@@ -6,8 +6,10 @@ mod mesh;
 use std::sync::{Arc, LazyLock};
 
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
-use pliant_body::{BodyRefused, BodyState, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin};
-use pliant_modal::ModalModel;
+use pliant_body::{
+    BodyRefused, BodyState, FixedObstacles, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin,
+};
+use pliant_modal::{FixedObstacle, FixedShape, ModalModel};
 
 use crate::{
     BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,
@@ -276,4 +278,34 @@ fn a_body_falls_when_the_one_below_is_removed_and_through_one_that_it_does_not_t
     app.world_mut().despawn(below);
     seconds(&mut app, 2.0);
     assert!(center(&app, above).y < 0.6 * EDGE, "{}", center(&app, above));
+}
+
+#[test]
+fn who_steps_a_body_elsewhere_is_told_what_stands_still() {
+    let mut app = app();
+    app.world_mut().spawn(Obstacle::Floor);
+    app.world_mut().spawn((Obstacle::Ball { radius: 0.5 }, Transform::from_xyz(3.0, 0.0, 0.0)));
+    let capsule = Obstacle::Capsule { radius: 0.1, half_length: 0.2 };
+    let moves = app.world_mut().spawn((capsule, Transform::from_xyz(9.0, 0.0, 0.0))).id();
+    let layers = ContactLayers { memberships: 2, filters: 2 };
+    app.world_mut().spawn((Obstacle::Box { half: Vec3::ONE }, layers));
+    let own = (BodyFriction(0.3), ContactLayers { memberships: 1, ..default() });
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 1.0, 0.0).with_scale(Vec3::splat(2.0)), own);
+    seconds(&mut app, 0.1);
+    let told = |app: &mut App| {
+        app.world_mut().entity_mut(body).insert(FixedObstacles::default());
+        app.world().get::<FixedObstacles>(body).unwrap().clone()
+    };
+    assert_eq!(told(&mut app).obstacles.len(), 3);
+    app.world_mut().get_mut::<Transform>(moves).unwrap().translation.x += 0.01;
+    app.update();
+    let FixedObstacles { friction, obstacles } = told(&mut app);
+    // In the world of the body, in which all lengths are halved.
+    let ball = FixedObstacle {
+        shape: FixedShape::Ball { radius: 0.25 },
+        position: [1.5, 0.0, 0.0],
+        ..FixedObstacle::GROUND
+    };
+    assert!(friction == 0.3 && obstacles.len() == 2, "{obstacles:?}");
+    assert!(obstacles.contains(&FixedObstacle::GROUND) && obstacles.contains(&ball), "{obstacles:?}");
 }

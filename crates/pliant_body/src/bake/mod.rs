@@ -1,5 +1,6 @@
 //! Baking inside the running game.
 
+mod extras;
 mod from_mesh;
 mod job;
 mod request;
@@ -9,6 +10,7 @@ use std::collections::VecDeque;
 use bevy::prelude::*;
 use pliant_bake::BakeCache;
 
+pub use extras::BakeExtrasError;
 pub use from_mesh::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS};
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 

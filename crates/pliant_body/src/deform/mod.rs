@@ -11,7 +11,7 @@ mod drawing;
 mod gpu;
 mod topology;
 
-use std::sync::Arc;
+use std::{ops::Range, sync::Arc};
 
 use bevy::{
     asset::{AssetEventSystems, RenderAssetUsages},
@@ -23,10 +23,11 @@ use bevy::{
     mesh::{Indices, PrimitiveTopology},
     platform::time::Instant,
     prelude::*,
+    utils::Parallel,
 };
 use pliant_modal::{HeldShapes, ModalModel};
 
-use crate::{BodyState, DEFORM_TIME, ModalBody, PliantDisplaySystems, VisualState};
+use crate::{BodyState, DEFORM_TIME, ModalBody, PliantDisplaySystems, VisualState, step::batches};
 use detail::{Detail, Views};
 use drawing::{Drawing, Drawings};
 use gpu::{Compute, GpuShape};
@@ -135,7 +136,11 @@ fn make_meshes(
         visual.draw(&mut q);
         let shape = cpu::Shape { q: &q, warped: state.warps(), held: held(visual) };
         let topology = &drawing.topology;
-        let bounds = cpu::write(model, state.precision(), topology, &shape, &mut mesh, &mut scratch);
+        let bounds = cpu::Vertices::take(&mut mesh, topology).map(|mut vertices| {
+            let bounds = vertices.write(model, state.precision(), topology, &shape, &mut scratch);
+            vertices.give(&mut mesh);
+            bounds
+        });
         let mesh = meshes.add(mesh);
         // The entity may have been despawned in this frame.
         commands
@@ -212,11 +217,31 @@ fn new_mesh(model: &ModalModel, topology: &Topology) -> Mesh {
 
 /// Buffers that are reused for all bodies and frames.
 #[derive(Default)]
-struct Scratch {
-    cpu: cpu::Scratch,
+struct DeformScratch {
+    /// One for each thread.
+    cpu: Parallel<cpu::Scratch>,
     q: Vec<f64>,
     moved: Vec<[f32; 4]>,
+    /// Coordinates of the surfaces that the CPU writes.
+    kept: Vec<f64>,
 }
+
+/// A surface that the CPU writes in this frame.
+struct Written<'a> {
+    state: &'a BodyState,
+    visual: &'a VisualState,
+    mesh: AssetId<Mesh>,
+    drawn: Mut<'a, DrawnSurface>,
+    aabb: Mut<'a, Aabb>,
+    /// Where its coordinates are.
+    kept: Range<usize>,
+    warped: bool,
+    vertices: cpu::Vertices,
+    bounds: Aabb,
+}
+
+/// Vertices that are worth handing out to another thread.
+const WORTH: usize = 2_000;
 
 fn deform_surfaces(
     mut commands: Commands,
@@ -224,7 +249,7 @@ fn deform_surfaces(
     compute: Option<Res<Compute>>,
     mut meshes: ResMut<Assets<Mesh>>,
     mut diagnostics: Diagnostics,
-    mut scratch: Local<Scratch>,
+    mut scratch: Local<DeformScratch>,
     cameras: Query<(&Camera, &GlobalTransform)>,
     mut bodies: Query<(
         Entity,
@@ -242,7 +267,9 @@ fn deform_surfaces(
 ) {
     let start = Instant::now();
     let mut written = false;
-    let Scratch { cpu: scratch, q, moved: moved_by_hands } = &mut *scratch;
+    let mut by_cpu: Vec<Written<'_>> = Vec::new();
+    let DeformScratch { cpu: scratch, q, moved: moved_by_hands, kept: coordinates } = &mut *scratch;
+    coordinates.clear();
     let views = Views::new(cameras.iter());
     for (entity, state, visual, allowed, place, mesh, mut drawn, shape, mut aabb, inherited, view) in
         &mut bodies
@@ -308,18 +335,43 @@ fn deform_surfaces(
             if shape.is_some() {
                 commands.entity(entity).try_remove::<GpuShape>();
             }
-            let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
-            let shape = cpu::Shape { q: kept, warped: detail.warped, held: held(visual) };
-            let topology = &drawn.drawing.topology;
-            let bounds = cpu::write(&drawn.model, state.precision(), topology, &shape, &mut mesh, scratch);
-            if let Some(bounds) = bounds {
-                aabb.set_if_neq(bounds);
-            }
+            let Some(mut asset) = meshes.get_mut(&mesh.0) else { continue };
+            (drawn.version, drawn.detail, drawn.computed) = (visual.version(), detail, false);
+            let Some(vertices) = cpu::Vertices::take(&mut asset, &drawn.drawing.topology) else { continue };
+            let begin = coordinates.len();
+            coordinates.extend_from_slice(kept);
+            by_cpu.push(Written {
+                state,
+                visual,
+                mesh: mesh.id(),
+                drawn,
+                aabb,
+                kept: begin..coordinates.len(),
+                warped: detail.warped,
+                vertices,
+                bounds: Aabb::default(),
+            });
+            continue;
         }
-        drawn.version = visual.version();
-        drawn.detail = detail;
-        drawn.computed = compute;
+        (drawn.version, drawn.detail, drawn.computed) = (visual.version(), detail, true);
         written = true;
+    }
+    written |= !by_cpu.is_empty();
+    let work: usize = by_cpu.iter().map(|surface| surface.drawn.drawing.topology.source.len()).sum();
+    batches(&mut by_cpu, work >= WORTH, |part| {
+        let mut scratch = scratch.borrow_local_mut();
+        for Written { state, visual, drawn, kept, warped, vertices, bounds, .. } in part {
+            let shape = cpu::Shape { q: &coordinates[kept.clone()], warped: *warped, held: held(visual) };
+            let topology = &drawn.drawing.topology;
+            *bounds = vertices.write(&drawn.model, state.precision(), topology, &shape, &mut scratch);
+        }
+    });
+    for mut surface in by_cpu {
+        surface.aabb.set_if_neq(surface.bounds);
+        // Its change was noted when the vertices were taken.
+        if let Some(mesh) = meshes.get_mut_untracked(surface.mesh) {
+            surface.vertices.give(mesh);
+        }
     }
     if written {
         diagnostics.add_measurement(&DEFORM_TIME, || start.elapsed().as_secs_f64() * 1e3);

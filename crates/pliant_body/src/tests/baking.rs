@@ -12,8 +12,8 @@ use pliant_mesh::shapes;
 
 use super::{Told, app, model, refusals, state, tick};
 use crate::{
-    ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeSkin,
-    BodyState, ModalAsset, ModalBody,
+    ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeExtrasError, BakeFailed, BakePlugin, BakeProgress,
+    BakeRequest, BakeSkin, BodyState, ModalAsset, ModalBody,
 };
 
 fn baking_app(cache: Option<BakeCache>) -> App {
@@ -52,6 +52,38 @@ fn wait(app: &mut App, entity: Entity) -> Vec<BakeProgress> {
         assert!(start.elapsed() < Duration::from_secs(300), "no end: {:?}", seen.last());
         std::thread::sleep(Duration::from_millis(1));
     }
+}
+
+/// What Blender writes for an object with custom properties. All frequencies of an elastic body are
+/// proportional to the root of stiffness over density.
+#[test]
+fn the_properties_of_a_model_say_how_it_is_baked() {
+    let free = || {
+        let mut request = bar(4);
+        request.config.anchors.clear();
+        request
+    };
+    let json = r#"{"anchor":"x<0.001","stiffness":45000.0,"density":500,"skein":[{"a":{"b":1}}]}"#;
+    let request = free().with_extras(json).unwrap();
+    let (plain, given) = (bar(4).config, request.config);
+    assert_eq!((given.anchors.clone(), given.young, given.density), (plain.anchors.clone(), 45e3, 500.0));
+    let frequencies = |config: &BakeConfig| {
+        let tets = shapes::bar([12, 3, 3], [1.0, 0.2, 0.2]).unwrap();
+        pliant_bake::bake(&tets, None, config, &mut |_, _| ()).unwrap().model.omega().to_vec()
+    };
+    let expected = (45e3 / 500.0 / (plain.young / plain.density)).sqrt();
+    for (new, old) in frequencies(&given).iter().zip(frequencies(&plain)) {
+        assert!((new / old - expected).abs() < 1e-6 * expected, "{new}, {old}, {expected}");
+    }
+    // Several anchors come on top of those of the request, and what is not given stays.
+    let two = bar(4).with_extras(r#"{"anchor":["x>0.999","z < 0"]}"#).unwrap().config;
+    assert_eq!((two.anchors.len(), two.young, two.density), (3, plain.young, plain.density));
+    assert_eq!(bar(4).with_extras("{}").unwrap().config, plain);
+    for wrong in ["", "7", "[]", r#"{"anchor":3}"#, r#"{"density":"heavy"}"#, r#"{"stiffness":true}"#] {
+        assert!(matches!(bar(4).with_extras(wrong), Err(BakeExtrasError::Json(_))), "{wrong}");
+    }
+    let error = bar(4).with_extras(r#"{"anchor":"left"}"#).unwrap_err();
+    assert!(matches!(&error, BakeExtrasError::Anchor(of) if of.text == "left"), "{error}");
 }
 
 #[test]

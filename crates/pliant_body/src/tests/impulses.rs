@@ -49,7 +49,7 @@ fn changes_by(scale: f32, impulse: DVec3, send: impl FnOnce(&mut World, Entity))
 const J: DVec3 = DVec3::new(0.7, -1.1, 0.4);
 
 #[test]
-fn a_strike_changes_momentum_by_itself_and_spin_by_its_moment() {
+fn an_impulse_changes_momentum_by_itself_and_spin_by_its_moment() {
     for scale in [1.0, 2.5] {
         changes_by(scale, J, |world, body| {
             world.write_message(Impulse { body, vertex: VERTEX, impulse: 3.0 * J });
@@ -68,7 +68,7 @@ fn a_push_brings_in_its_force_times_one_tick() {
 }
 
 #[test]
-fn a_resting_body_is_woken_by_a_blow_or_a_push_and_not_by_a_refused_one() {
+fn a_resting_body_is_woken_by_an_impulse_or_a_push_and_not_by_a_refused_one() {
     for pushed in [false, true] {
         let mut app = app();
         let body = spawn(&mut app, model::bar(), ());
@@ -92,7 +92,7 @@ fn a_resting_body_is_woken_by_a_blow_or_a_push_and_not_by_a_refused_one() {
 }
 
 #[test]
-fn a_strike_gives_a_mode_its_shape_times_the_impulse() {
+fn an_impulse_gives_a_mode_its_shape_times_the_impulse() {
     // For bending along y, phi(tip) = sqrt(5/m). An entity of scale 2 receives half of the impulse
     // in the body's own world.
     for scale in [1.0, 2.0] {
@@ -126,7 +126,6 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
         (body, VERTEX, DVec3::new(0.0, f64::INFINITY, 0.0), "finite"),
         (body, VERTEX, DVec3::splat(f64::MAX), "impulse: expected one"),
         (body, 1_000_000, DVec3::Y, "vertex 1000000"),
-        (remote, VERTEX, DVec3::Y, "remotely"),
         (none, VERTEX, DVec3::Y, "no body"),
         (gone, VERTEX, DVec3::Y, "no body"),
     ];
@@ -143,6 +142,14 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
         }
         assert_eq!(*state(&app, body).body().state(), before);
     }
+    // An impulse on a remote body is left to who drives it, and nobody takes a force.
+    app.world_mut().write_message(Impulse { body: remote, vertex: VERTEX, impulse: DVec3::Y });
+    steps(&mut app, 2);
+    assert_eq!(refusals(&mut app).len(), 0);
+    app.world_mut().write_message(Push { body: remote, vertex: VERTEX, force: DVec3::Y });
+    steps(&mut app, 2);
+    let told = refusals(&mut app);
+    assert!(told.len() == 1 && told[0].0 == remote && told[0].1.contains("remotely"), "{told:?}");
     // The force overflows: the step is refused once, and the next step is valid again.
     app.world_mut().write_message(Push { body, vertex: VERTEX, force: DVec3::splat(f64::MAX) });
     steps(&mut app, 3);
