@@ -1,4 +1,5 @@
-//! Bevy plugin for Pliant sessions over QUIC, in which several people hold the same soft bodies.
+//! Bevy plugin for Pliant sessions, in which several people hold the same soft bodies. Sessions
+//! have QUIC connections of their own, or ride on a game's netcode ([`CarrierPort`]).
 //!
 //! A host steps the bodies and may also hold them. Guests see the bodies, hold them and feel their
 //! forces. Among peers ([`NetPlugin::peer`]) every peer steps the bodies. One plugin covers all
@@ -32,7 +33,8 @@
 //! | [`Grab`](pliant_body::Grab) and [`GrabOf`](pliant_body::GrabOf), on guests and on the host | [`GrabForce`](pliant_body::GrabForce): the reaction, in step with the displayed shape |
 //! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: the users, the quality of their connections, their grabs |
 //! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages |
-//! | [`Interest`] on a guest's body: how many modes the guest wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`]: messages |
+//! | [`Interest`] on a guest's body: how many modes the guest wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`], [`SessionFailed`]: messages, and events for observers |
+//! | [`SessionCommands`]: sessions that begin and end while the app runs, also over the app's own [`Carrier`] | [`SessionState`]: a resource |
 //! | | [`RemoteHands`] on a guest's bodies: where the other users' hands are |
 //!
 //! A pointer, a script or a device drags a guest's [`Driven::Remote`](pliant_body::Driven::Remote)
@@ -66,6 +68,7 @@ mod recording;
 mod remote;
 mod retry;
 mod roster;
+mod session;
 mod session_transform;
 mod shared_body;
 pub mod transport;
@@ -87,11 +90,13 @@ pub use peer::{NetPeer, PeerConfig, PeerState};
 pub use plugin::{NetError, NetPlugin, NetSystems};
 pub use recording::{RecordingError, SessionRecording};
 pub use remote::{
-    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, SessionClosed, SessionJoined,
-    SessionLost,
+    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, SessionClosed, SessionFailed,
+    SessionJoined, SessionLost,
 };
+pub use session::{SessionCommands, SessionState};
 pub use shared_body::SharedBody;
 pub use transport::{
-    Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions, Role, Token,
+    Access, Carrier, CarrierPort, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions,
+    MeshCarrier, Role, Token,
 };
 pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, color_of};

@@ -1,9 +1,10 @@
 //! Network metrics, as a resource for games and as diagnostics for tools that display them.
 
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bevy::diagnostic::{Diagnostic, DiagnosticPath, Diagnostics, RegisterDiagnostic};
+use bevy::platform::time::Instant;
 use bevy::prelude::*;
 use pliant_stream::{LinkStats, PeerId};
 
@@ -36,9 +37,9 @@ pub const VISUAL_OFFSET: DiagnosticPath = DiagnosticPath::const_new("pliant/net/
 
 /// Network metrics, refreshed every frame.
 ///
-/// Counts start when the app starts and never fall: closed connections stay counted. A host adds up
-/// its guests, and a peer adds up the other peers. Both report the worst round trip and the mean
-/// loss.
+/// Counts start with the session and never fall in it: closed connections stay counted. A host adds
+/// up its guests, and a peer adds up the other peers. Both report the worst round trip and the mean
+/// loss. Without a session all is zero.
 #[derive(Resource, Reflect, Debug, Clone, Copy, Default, PartialEq)]
 #[reflect(Resource, Debug, Default, Clone, PartialEq)]
 pub struct NetStats {

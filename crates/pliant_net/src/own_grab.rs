@@ -1,9 +1,10 @@
-//! The app's own grabs on bodies that a session steps, alike on a guest and a peer.
+//! The app's own grabs on bodies that a session steps, and its impulses, alike on a guest and a
+//! peer.
 
 use std::collections::BTreeMap;
 
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
+use pliant_body::{BodyError, BodyRefused, BodyState, Grab, GrabForce, GrabOf, Impulse, VisualState};
 use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::{BodyId, StreamError};
 
@@ -113,6 +114,24 @@ pub(crate) fn send_grabs<'a, S: HandSession>(
             None => {
                 sent.insert(entity, session.begin(body, grab, state.model(), target));
             }
+        }
+    }
+}
+
+/// Sends the app's impulses on the session's bodies, each once, and reports those that the session
+/// does not take.
+pub(crate) fn send_impulses<'a>(
+    impulses: &mut MessageReader<Impulse>,
+    refused: &mut Vec<BodyRefused>,
+    body_of: impl Fn(Entity) -> Option<(BodyId, &'a BodyState, &'a GlobalTransform)>,
+    mut send: impl FnMut(BodyId, u32, [f64; 3]) -> Result<(), StreamError>,
+) {
+    for &Impulse { body: entity, vertex, impulse } in impulses.read() {
+        let Some((body, state, transform)) = body_of(entity) else { continue };
+        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
+        if let Err(error) = send(body, vertex, place.force_to_session(impulse)) {
+            warn!("{entity}: an impulse was refused: {error}");
+            refused.push(BodyRefused { entity, error: BodyError::NotTaken { why: error.to_string() } });
         }
     }
 }

@@ -1,5 +1,6 @@
 //! The network plugin and its system sets.
 
+use std::convert::Infallible;
 use std::sync::{Mutex, PoisonError};
 
 use bevy::camera::visibility::VisibilitySystems;
@@ -7,6 +8,7 @@ use bevy::diagnostic::Diagnostics;
 use bevy::ecs::schedule::{InternedScheduleLabel, ScheduleLabel};
 use bevy::prelude::*;
 use pliant_body::{PliantDisplaySystems, PliantSystems};
+use pliant_stream::{DisconnectReason, StreamError};
 use thiserror::Error;
 
 use crate::guest::{self, Interest, JoinConfig, NetGuest};
@@ -15,11 +17,12 @@ use crate::metrics::{self, NetStats, RateMarks};
 use crate::peer::{self, NetPeer, PeerConfig};
 use crate::recording::{RecordingError, SessionRecording};
 use crate::remote::{self, RemoteBody, RemoteHands};
+use crate::session::{self, Opened, SessionControl, SessionState};
 use crate::shared_body::SharedBody;
-use crate::transport::{Endpoint, Invite, TransportError};
+use crate::transport::{Invite, InviteError, TransportError};
 use crate::user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself};
 
-/// Why a session could not be set up.
+/// Why a session could not begin.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NetError {
@@ -29,25 +32,37 @@ pub enum NetError {
     /// The file to record to, or to play, could not be used.
     #[error(transparent)]
     Recording(#[from] RecordingError),
+    /// The text is no invite.
+    #[error(transparent)]
+    Invite(#[from] InviteError),
+    /// The settings do not make a session.
+    #[error("the session cannot begin with these settings: {0}")]
+    Settings(#[from] StreamError),
+    /// The other side was not reached, or did not admit this app.
+    #[error("not joined: {0}")]
+    NotJoined(DisconnectReason),
 }
 
-/// Hosts a session, joins one, plays among peers, or plays a recording. Add it after
+impl From<Infallible> for NetError {
+    fn from(never: Infallible) -> Self {
+        match never {}
+    }
+}
+
+/// Sessions: hosts one, joins one, plays among peers, or plays a recording. Add it after
 /// [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin).
 ///
-/// The constructor opens the socket, so that a host's invite can be shown before the app runs. The
-/// host admits no guest before the app runs. The other participants receive a goodbye when the app
-/// ends (closed, or by Ctrl-C if Bevy's `TerminalCtrlCHandlerPlugin` turns it into an exit), or
-/// when [`NetHost`], [`NetGuest`] or [`NetPeer`] is removed.
+/// The default has no session: the app begins and leaves sessions while it runs, with
+/// [`SessionCommands`](crate::SessionCommands). The other constructors open a session's socket at
+/// once, so that a host's invite can be shown before the app runs, and issue the same command when
+/// the app starts. The host admits no guest before the app runs.
+///
+/// The other participants receive a goodbye when the app leaves the session or ends (closed, or by
+/// Ctrl-C if Bevy's `TerminalCtrlCHandlerPlugin` turns it into an exit).
 pub struct NetPlugin {
-    start: Mutex<Option<Start>>,
+    start: Mutex<Option<Opened>>,
     invite: Option<Invite>,
     schedule: InternedScheduleLabel,
-}
-
-enum Start {
-    Host(Box<HostConfig>, Endpoint),
-    Join(Box<NetGuest>),
-    Peer(Box<NetPeer>),
 }
 
 /// System sets of the plugin.
@@ -67,31 +82,25 @@ impl NetPlugin {
     ///
     /// # Errors
     /// [`NetError::Transport`] when the socket or the keys cannot be set up.
-    pub fn host(mut config: HostConfig) -> Result<Self, NetError> {
-        let endpoint = Endpoint::host(std::mem::take(&mut config.transport))?;
-        let invite = Some(endpoint.invite());
-        Ok(Self::new(Start::Host(Box::new(config), endpoint), invite))
+    pub fn host(config: HostConfig) -> Result<Self, NetError> {
+        Ok(Self::new(Some(session::open_host(config)?)))
     }
 
     /// Joins the session of an invite. The outcome is known later, from [`NetGuest::state`],
-    /// [`SessionJoined`](crate::SessionJoined) and [`SessionClosed`](crate::SessionClosed).
+    /// [`SessionJoined`](crate::SessionJoined) and [`SessionFailed`](crate::SessionFailed).
     ///
     /// # Errors
     /// [`NetError::Transport`] when the socket or the keys cannot be set up,
     /// [`NetError::Recording`] when the file to record to cannot be created.
-    pub fn join(invite: &Invite, mut config: JoinConfig) -> Result<Self, NetError> {
-        let limits = config.transport.limits.clone();
-        let endpoint = Endpoint::join(invite, std::mem::take(&mut config.transport))?;
-        config.transport.limits = limits;
-        Ok(Self::new(Start::Join(Box::new(NetGuest::join(config, endpoint)?)), None))
+    pub fn join(invite: &Invite, config: JoinConfig) -> Result<Self, NetError> {
+        Ok(Self::new(Some(session::open_guest(invite, config)?)))
     }
 
     /// Plays a recorded session in a guest, at the speed at which it was recorded. Bodies, users
     /// and hands appear and disappear as they did in the recorded session. Nothing is sent, and
     /// this app's own grabs have no effect.
-    pub fn replay(recording: SessionRecording, mut config: JoinConfig) -> Self {
-        config.models.extend(recording.models.iter().cloned());
-        Self::new(Start::Join(Box::new(NetGuest::replay(config, recording))), None)
+    pub fn replay(recording: SessionRecording, config: JoinConfig) -> Self {
+        Self::new(Some(session::open_replay(recording, config)))
     }
 
     /// Plays among peers, each of which steps the bodies. Starts a new session if
@@ -100,13 +109,12 @@ impl NetPlugin {
     /// # Errors
     /// [`NetError::Transport`] when a socket or the keys cannot be set up.
     pub fn peer(config: PeerConfig) -> Result<Self, NetError> {
-        let peer = NetPeer::open(config)?;
-        let invite = Some(peer.invite());
-        Ok(Self::new(Start::Peer(Box::new(peer)), invite))
+        Ok(Self::new(Some(session::open_peer(config)?)))
     }
 
-    fn new(start: Start, invite: Option<Invite>) -> Self {
-        Self { start: Mutex::new(Some(start)), invite, schedule: FixedUpdate.intern() }
+    fn new(start: Option<Opened>) -> Self {
+        let invite = start.as_ref().and_then(Opened::invite);
+        Self { start: Mutex::new(start), invite, schedule: FixedUpdate.intern() }
     }
 
     /// Sets the schedule in which the bodies are stepped. Default: `FixedUpdate`.
@@ -115,23 +123,29 @@ impl NetPlugin {
         self
     }
 
-    /// Returns the invite to this host or peer. `None` for a guest.
+    /// Returns the invite to this host or peer. `None` for a guest, and without a session.
     pub fn invite(&self) -> Option<&Invite> {
         self.invite.as_ref()
+    }
+}
+
+impl Default for NetPlugin {
+    /// Begins without a session.
+    fn default() -> Self {
+        Self::new(None)
     }
 }
 
 impl Plugin for NetPlugin {
     fn build(&self, app: &mut App) {
         let start = self.start.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let Some(start) = start else {
-            error!("a NetPlugin can be added to one app only; this app has no network");
-            return;
-        };
         metrics::register(app);
-        remote::register_types(app);
-        app.init_resource::<NetStats>()
+        remote::register(app);
+        app.insert_resource(SessionControl::starting(start))
+            .init_resource::<SessionState>()
+            .init_resource::<NetStats>()
             .init_resource::<RateMarks>()
+            .register_type::<SessionState>()
             .register_type::<SharedBody>()
             .register_type::<Holding>()
             .register_type::<Interest>()
@@ -146,72 +160,63 @@ impl Plugin for NetPlugin {
             .register_type::<UserJoined>()
             .register_type::<UserLeft>()
             .add_message::<UserJoined>()
-            .add_message::<UserLeft>()
+            .add_message::<UserLeft>();
+        // The systems of all roles are there, and those of the role that the app has run.
+        app.add_systems(PreStartup, session::start)
+            .add_systems(PreUpdate, session::follow.run_if(session::is_busy).in_set(NetSystems::Receive))
+            .add_systems(
+                self.schedule,
+                (
+                    host::move_hands.before(PliantSystems::Input),
+                    host::publish.in_set(NetSystems::Send).after(PliantSystems::Publish),
+                )
+                    .run_if(resource_exists::<NetHost>),
+            )
+            .add_systems(
+                PostUpdate,
+                (
+                    host::finish.run_if(resource_exists::<NetHost>),
+                    (guest::send_hands, guest::show)
+                        .chain()
+                        .in_set(NetSystems::Show)
+                        .before(PliantDisplaySystems::Interpolate)
+                        .run_if(resource_exists::<NetGuest>),
+                    (guest::look, guest::send_interest)
+                        .chain()
+                        .after(VisibilitySystems::UpdateFrusta)
+                        .run_if(resource_exists::<NetGuest>),
+                    (peer::send_hands, peer::show)
+                        .chain()
+                        .in_set(NetSystems::Show)
+                        .before(PliantDisplaySystems::Interpolate)
+                        .run_if(resource_exists::<NetPeer>),
+                ),
+            )
             .add_systems(Last, measure);
-        match start {
-            Start::Host(config, endpoint) => {
-                let mut start = Some((config, endpoint));
-                let begin = move |world: &mut World| {
-                    let Some((config, endpoint)) = start.take() else { return };
-                    if let Err(error) = NetHost::start(world, endpoint, &config) {
-                        error!("the session cannot be hosted: {error}");
-                    }
-                };
-                app.add_systems(PreStartup, begin)
-                    .add_systems(PreUpdate, host::receive.in_set(NetSystems::Receive))
-                    .add_systems(
-                        self.schedule,
-                        (
-                            host::move_hands.before(PliantSystems::Input),
-                            host::publish.in_set(NetSystems::Send).after(PliantSystems::Publish),
-                        ),
-                    )
-                    .add_systems(PostUpdate, host::finish);
-            }
-            Start::Join(guest) => {
-                remote::register(app);
-                app.insert_resource(*guest)
-                    .add_systems(PreUpdate, guest::receive.in_set(NetSystems::Receive))
-                    .add_systems(
-                        PostUpdate,
-                        (guest::send_hands, guest::show)
-                            .chain()
-                            .in_set(NetSystems::Show)
-                            .before(PliantDisplaySystems::Interpolate),
-                    )
-                    .add_systems(
-                        PostUpdate,
-                        (guest::look, guest::send_interest).chain().after(VisibilitySystems::UpdateFrusta),
-                    );
-            }
-            Start::Peer(peer) => {
-                remote::register(app);
-                app.insert_resource(*peer)
-                    .add_systems(PreUpdate, peer::receive.in_set(NetSystems::Receive))
-                    .add_systems(
-                        PostUpdate,
-                        (peer::send_hands, peer::show)
-                            .chain()
-                            .in_set(NetSystems::Show)
-                            .before(PliantDisplaySystems::Interpolate),
-                    );
-            }
-        }
     }
 }
 
-/// `Last`: updates the metrics of this frame.
+/// `Last`: updates the metrics of this frame, and tells of impulses that no session took.
 fn measure(
     host: Option<ResMut<NetHost>>,
-    guest: Option<ResMut<NetGuest>>,
-    peer: Option<ResMut<NetPeer>>,
+    mut guest: Option<ResMut<NetGuest>>,
+    mut peer: Option<ResMut<NetPeer>>,
+    mut commands: Commands,
     mut stats: ResMut<NetStats>,
     mut marks: ResMut<RateMarks>,
     mut diagnostics: Diagnostics,
 ) {
+    let refused = guest.as_mut().map(|guest| std::mem::take(&mut guest.refused_impulses));
+    let of_peer = peer.as_mut().map(|peer| std::mem::take(&mut peer.refused_impulses));
+    refused.into_iter().chain(of_peer).flatten().for_each(|refused| commands.trigger(refused));
     let new = host.map(|mut host| host.metrics()).or_else(|| guest.map(|mut guest| guest.metrics()));
     let new = new.or_else(|| peer.map(|mut peer| peer.metrics()));
-    let mut new = new.unwrap_or_default();
+    let Some(mut new) = new else {
+        if stats.set_if_neq(NetStats::default()) {
+            *marks = RateMarks::default();
+        }
+        return;
+    };
     new.keep_rates(&stats, &mut marks, &mut diagnostics);
     new.measure(&mut diagnostics);
     stats.set_if_neq(new);

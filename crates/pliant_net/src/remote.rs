@@ -1,9 +1,13 @@
 //! Components and messages through which a guest's app sees the session.
 
+use std::sync::Arc;
+
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use bevy::reflect::reflect_remote;
 use pliant_stream::{BodyId, DisconnectReason, Role, UserId};
+
+use crate::plugin::NetError;
 
 // The protocol's types do not depend on an engine. Reflection accesses their fields through these.
 
@@ -84,8 +88,8 @@ pub struct GrabRefused {
 
 /// The guest has lost its connection to the host. Bodies keep their last displayed state, the
 /// entities of the other users are despawned, and the guest tries to join again
-/// ([`JoinConfig::rejoin`](crate::JoinConfig::rejoin)).
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// ([`JoinConfig::rejoin`](crate::JoinConfig::rejoin)). A message, and an event for observers.
+#[derive(Message, Event, Reflect, Debug, Clone, PartialEq)]
 #[reflect(opaque)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct SessionLost {
@@ -93,8 +97,9 @@ pub struct SessionLost {
     pub reason: DisconnectReason,
 }
 
-/// This app has joined the session, for the first time or again.
-#[derive(Message, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+/// This app is in the session: it hosts one, or has joined one for the first time or again. A
+/// message, and an event for observers.
+#[derive(Message, Event, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
 #[reflect(opaque)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct SessionJoined {
@@ -105,8 +110,10 @@ pub struct SessionJoined {
     pub reconnected: bool,
 }
 
-/// The session is over.
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// A session that this app was in is over. What it displayed stays until the app leaves it
+/// ([`SessionCommands::leave_session`](crate::SessionCommands::leave_session)) or begins another
+/// one. A message, and an event for observers.
+#[derive(Message, Event, Reflect, Debug, Clone, PartialEq)]
 #[reflect(opaque)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct SessionClosed {
@@ -114,21 +121,29 @@ pub struct SessionClosed {
     pub reason: DisconnectReason,
 }
 
-/// Registers the types for every role: what one role saves, another may load.
-pub(crate) fn register_types(app: &mut App) {
+/// A session could not begin: the socket could not be opened, the invite is none, or the other side
+/// was not reached or did not admit this app. A message, and an event for observers.
+#[derive(Message, Event, Reflect, Debug, Clone)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone)]
+pub struct SessionFailed {
+    /// The reason.
+    pub reason: Arc<NetError>,
+}
+
+pub(crate) fn register(app: &mut App) {
     app.register_type::<BodyArrived>()
         .register_type::<BodyLeft>()
         .register_type::<GrabRefused>()
         .register_type::<SessionLost>()
         .register_type::<SessionJoined>()
-        .register_type::<SessionClosed>();
-}
-
-pub(crate) fn register(app: &mut App) {
-    app.add_message::<BodyArrived>()
+        .register_type::<SessionClosed>()
+        .register_type::<SessionFailed>()
+        .add_message::<BodyArrived>()
         .add_message::<BodyLeft>()
         .add_message::<GrabRefused>()
         .add_message::<SessionLost>()
         .add_message::<SessionJoined>()
-        .add_message::<SessionClosed>();
+        .add_message::<SessionClosed>()
+        .add_message::<SessionFailed>();
 }

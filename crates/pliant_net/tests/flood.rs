@@ -16,7 +16,7 @@ use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{Grab, GrabOf};
 use pliant_modal::ModalModel;
-use pliant_net::transport::{Endpoint, Event, JoinOptions, Limits, RateCap};
+use pliant_net::transport::{Carrier, Endpoint, Event, JoinOptions, Limits, RateCap};
 use pliant_net::{
     GrabRefused, HandOf, HostConfig, HostOptions, Invite, JoinConfig, NetHost, SessionClosed, SessionLost,
 };
@@ -236,7 +236,7 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration, whom: Whom) -> Flooded {
     assert!(messages::<SessionLost>(&first).is_empty() && messages::<SessionClosed>(&first).is_empty());
     assert!(messages::<GrabRefused>(&first).is_empty());
     let world = host.world().resource::<NetHost>();
-    let dropped = world.endpoint().stats(PeerId(1)).unwrap().dropped;
+    let dropped = world.endpoint().unwrap().stats(PeerId(1)).unwrap().dropped;
     assert_eq!((dropped.receive_queue_full, dropped.send_queue_full), (0, 0));
     let strangers = if whom == Whom::ThisHost { floods.len() } else { 0 };
     assert_eq!(world.session().users().count(), 2 + strangers, "the guests and the strangers are in");

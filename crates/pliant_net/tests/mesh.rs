@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_body::{ModalAsset, ModalBody};
-use pliant_net::transport::{Endpoint, Event, JoinOptions, Limits};
+use pliant_net::transport::{Carrier, Endpoint, Event, JoinOptions, Limits};
 use pliant_net::{
     Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, NetPeer, NetPlugin, PeerConfig,
     PeerState, SharedBody, Token, User,

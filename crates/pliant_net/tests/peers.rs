@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody, VisualState};
-use pliant_modal::{Body, ModalModel, StepSettings};
+use pliant_body::{FixedObstacles, Grab, GrabForce, GrabOf, Impulse, ModalAsset, ModalBody, VisualState};
+use pliant_modal::{Body, FixedObstacle, FixedShape, ModalModel, StepSettings};
 use pliant_net::transport::Limits;
 use pliant_net::{
     Emulation, HostOptions, Invite, NetPeer, NetPlugin, NetStats, PeerConfig, PeerState, RemoteHands,
@@ -77,6 +77,38 @@ fn apart(a: &[f64], b: &[f64]) -> f64 {
 }
 
 #[test]
+fn a_peers_impulse_acts_at_all_peers_alike() {
+    let _quiet = alone();
+    let (mut first, body) = peer("a", None);
+    run_until(&mut [&mut first], "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let invite = first.world().resource::<NetPeer>().invite();
+    let (mut second, there) = peer("bb", Some(invite));
+    run_until(&mut [&mut first, &mut second], "both are in", |apps| {
+        let state = apps[1].world().resource::<NetPeer>().state();
+        matches!(state, PeerState::In { .. }) && users(apps[0]).len() == 2
+    });
+    run_frames(&mut [&mut first, &mut second], 30);
+    second.world_mut().write_message(Impulse {
+        body: there,
+        vertex: TIP,
+        impulse: DVec3::new(0.0, 1.5, -0.5),
+    });
+    run_until(&mut [&mut first, &mut second], "the same motion at both", |apps| {
+        let [a, b] = [(0, body), (1, there)].map(|(k, entity)| {
+            let net = apps[k].world().resource::<NetPeer>();
+            (net.session().unwrap(), net.body_of(entity).unwrap())
+        });
+        let tick = a.0.confirmed().min(b.0.confirmed());
+        let (x, y) = (a.0.state_at(a.1, tick).unwrap(), b.0.state_at(b.1, tick).unwrap());
+        must!(x.q.iter().any(|q| q.abs() > 0.01), "not struck yet: {x:?}");
+        assert_eq!(x, y, "the same to the bit");
+        Ok(())
+    });
+}
+
+#[test]
 fn a_turned_body_hangs_among_peers_as_it_does_alone() {
     let _quiet = alone();
     let bud = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bud.modal");
@@ -106,6 +138,55 @@ fn a_turned_body_hangs_among_peers_as_it_does_alone() {
         let shown = q(apps[0], entity);
         must!(shown.len() == alone.len() && apart(&alone, &shown) < 0.01, "{shown:?}, {alone:?}");
         must!(still(apps[0], entity));
+        Ok(())
+    });
+}
+
+/// A peer with a free body over a floor. Each machine lists the obstacles in another order.
+fn faller(name: &str, join: Option<Invite>, turned: bool) -> (App, Entity) {
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let jack = Arc::new(ModalModel::read(jack).unwrap());
+    let low = f64::from(jack.surface().bounds()[0][1]) - 0.05;
+    let mut app = app(NetPlugin::peer(PeerConfig { name: name.into(), join, ..default() }).unwrap());
+    app.add_observer(move |added: On<Insert, FixedObstacles>, mut bodies: Query<&mut FixedObstacles>| {
+        let floor = FixedObstacle { position: [0.0, low, 0.0], ..FixedObstacle::GROUND };
+        let ball = FixedObstacle { shape: FixedShape::Ball { radius: 0.1 }, position: [9.0; 3], ..floor };
+        let rotation = [0.0, 0.0, 0.0, -1.0];
+        let list = if turned { vec![FixedObstacle { rotation, ..ball }, floor] } else { vec![floor, ball] };
+        bodies.get_mut(added.entity).unwrap().obstacles = list;
+    });
+    let model = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(jack));
+    let settings = StepSettings { gravity: [0.0, -9.81, 0.0], ..StepSettings::default() };
+    let body = ModalBody { settings, ..ModalBody::new(model) };
+    let entity = app.world_mut().spawn((body, SharedBody::named("jack"))).id();
+    (app, entity)
+}
+
+#[test]
+fn a_free_body_of_peers_falls_onto_the_floor_that_both_have() {
+    let _quiet = alone();
+    let (mut a, body_a) = faller("a", None, false);
+    run_until(&mut [&mut a], "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let invite = a.world().resource::<NetPeer>().invite();
+    let (mut b, body_b) = faller("b", Some(invite), true);
+    let bodies = [body_a, body_b];
+    run_until(&mut [&mut a, &mut b], "it lies on the floor of both", |apps| {
+        let mut centers = Vec::new();
+        for app in apps.iter() {
+            let net = app.world().resource::<NetPeer>();
+            must!(matches!(net.state(), PeerState::In { .. }), "{:?}", net.state());
+            let Some(session) = net.session() else { return Err("no session".into()) };
+            let Some(id) = net.body_of(bodies[centers.len()]) else { return Err("no body".into()) };
+            let Some(played) = session.body(id) else { return Err("no body".into()) };
+            assert_eq!(played.surroundings().obstacles.len(), 2);
+            let frame = played.live().frame;
+            must!(session.tick() > 200 && frame.velocity().iter().all(|v| v.abs() < 0.01), "it moves");
+            centers.push(frame.center());
+        }
+        let apart = (0..3).map(|k| (centers[0][k] - centers[1][k]).abs()).fold(0.0, f64::max);
+        must!(apart < 1e-3 && centers[0][1].abs() < 1.0, "{centers:?}");
         Ok(())
     });
 }
@@ -242,6 +323,32 @@ fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_
     });
     run_frames(&mut [&mut a, &mut b, &mut c], 20);
     assert!([&a, &b, &c].iter().all(|app| app.world().resource::<NetPeer>().looked_for() == 0));
+}
+
+#[test]
+fn peers_that_a_third_introduces_find_each_other() {
+    let _alone = alone();
+    let (mut a, _) = quick_peer("a", None);
+    run_until(&mut [&mut a], "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let invite = a.world().resource::<NetPeer>().invite();
+    let (mut b, _) = quick_peer("bb", Some(invite));
+    run_until(&mut [&mut a, &mut b], "both know each other", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb"])
+    });
+    a.world_mut().resource_mut::<NetPeer>().set_emulation(cut());
+    run_until(&mut [&mut a, &mut b], "each is alone", |apps| {
+        apps.iter_mut().all(|app| users(app).len() == 1)
+    });
+    // It comes through the second, which does not know where the first is at this time.
+    let through = b.world().resource::<NetPeer>().invite();
+    let (mut c, _) = quick_peer("ccc", Some(through));
+    run_until(&mut [&mut a, &mut b, &mut c], "the third is in", |apps| users(apps[2]) == ["bb", "ccc"]);
+    a.world_mut().resource_mut::<NetPeer>().set_emulation(None);
+    run_until(&mut [&mut a, &mut b, &mut c], "all know all", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc"])
+    });
 }
 
 #[test]

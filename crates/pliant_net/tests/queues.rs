@@ -6,7 +6,7 @@
 #[path = "../src/transport/queue.rs"]
 mod queue;
 
-mod endpoint {
+mod carrier {
     use std::time::Instant;
 
     use bytes::Bytes;
@@ -62,7 +62,7 @@ use std::task::{Context, Poll, Wake, Waker};
 use std::time::Instant;
 
 use bytes::Bytes;
-use endpoint::Event;
+use carrier::Event;
 use loom::sync::{Arc, Condvar, Mutex};
 use loom::thread;
 use pliant_stream::{DisconnectReason, PeerId};

@@ -4,15 +4,18 @@
 mod support;
 
 use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_body::{
-    BodyState, Driven, Grab, GrabForce, GrabOf, ModalAsset, PliantSystems, PliantTick, VisualState,
+    BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Impulse, ModalAsset, PliantSystems, PliantTick,
+    VisualState,
 };
-use pliant_net::transport::{Emulation, Endpoint, Event, JoinOptions, PeerId};
+use pliant_modal::{ModalModel, ObstacleShape, Plane};
+use pliant_net::transport::{Carrier, Emulation, Endpoint, Event, JoinOptions, PeerId};
 use pliant_net::{
     BodyLeft, GrabRefused, GuestState, HandOf, Holding, HostConfig, JoinConfig, NetGuest, NetStats,
     RemoteBody, RemoteHands, SharedBody, User, UserLeft, UserLink,
@@ -20,8 +23,8 @@ use pliant_net::{
 use pliant_stream::UserId;
 use pliant_stream::emulator::Preset;
 use support::{
-    MIDDLE, TIP, alone, arrival, bar, guest, host, messages, must, only, patch_at_rest, rests, run_frames,
-    run_until, tick,
+    MIDDLE, TIP, alone, arrival, bar, guest, host, host_of, messages, must, only, patch_at_rest, rests,
+    run_frames, run_until, tick,
 };
 
 /// Returns the world position, in [`support::host`], of a point beside the center of the bar's
@@ -157,6 +160,79 @@ fn off(host: &App, shown: &BTreeMap<u64, Vec<f64>>, count: usize) -> (f64, f64) 
 /// While this resource exists, the host's hand rests.
 #[derive(Resource)]
 struct Still;
+
+#[test]
+fn a_guests_impulse_acts_once_on_the_hosts_body() {
+    let _alone = alone();
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let jack = Arc::new(ModalModel::read(jack).unwrap());
+    let (mut host, invite, body) = host_of(HostConfig::default(), jack.clone());
+    let mut guest = guest(&invite, JoinConfig::default());
+    let there = arrival(&mut host, &mut guest);
+    // The entity has twice the size, so lengths and impulses have, too. Its world moves as fast as
+    // an impulse over the mass says.
+    let sent = DVec3::new(0.25, 0.5, -0.125) * jack.mass();
+    let mass = jack.mass();
+    let momentum = move |app: &App| {
+        let frame = state(app, body).body().frame();
+        DVec3::from(frame.velocity()) * 2.0 * mass
+    };
+    assert_eq!(momentum(&host), DVec3::ZERO);
+    for times in 1..=3 {
+        guest.world_mut().write_message(Impulse { body: there, vertex: 7, impulse: sent });
+        run_until(&mut [&mut host, &mut guest], "the impulse has acted", |apps| {
+            let now = momentum(apps[0]);
+            must!(
+                now.distance(sent * f64::from(times)) < 1e-6 * sent.length(),
+                "{now}, {times} times {sent}"
+            );
+            Ok(())
+        });
+    }
+    run_frames(&mut [&mut host, &mut guest], 60);
+    assert!(momentum(&host).distance(3.0 * sent) < 1e-6 * sent.length(), "no impulse acts twice");
+    run_until(&mut [&mut host, &mut guest], "the guest sees it go", |apps| {
+        let moved = apps[1].world().get::<Transform>(there).unwrap().translation;
+        must!(moved.y > 1.2, "{moved}");
+        Ok(())
+    });
+    // A body that only the host may hold is not struck either, and what is no number is refused
+    // here.
+    host.world_mut().entity_mut(body).insert(Holding::HostOnly);
+    guest.world_mut().write_message(Impulse { body: there, vertex: 7, impulse: sent });
+    guest.world_mut().write_message(Impulse { body: there, vertex: 7, impulse: DVec3::NAN });
+    let refused = Arc::new(Mutex::new(Vec::new()));
+    let told = refused.clone();
+    guest.add_observer(move |of: On<BodyRefused>| told.lock().unwrap().push(of.error.to_string()));
+    run_frames(&mut [&mut host, &mut guest], 60);
+    assert!(momentum(&host).distance(3.0 * sent) < 1e-6 * sent.length(), "the host alone may");
+    let refused = refused.lock().unwrap();
+    assert!(refused.len() == 1 && refused[0].contains("finite"), "{refused:?}");
+}
+
+#[test]
+fn a_guest_is_told_what_stands_still_around_a_free_body() {
+    let _alone = alone();
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let jack = Arc::new(ModalModel::read(jack).unwrap());
+    let (mut host, invite, body) = host_of(HostConfig::default(), jack);
+    let mut guest = guest(&invite, JoinConfig::default());
+    arrival(&mut host, &mut guest);
+    let told = |guest: &App| {
+        let session = guest.world().resource::<NetGuest>().session().unwrap();
+        session.bodies().next().map(|view| view.info().around.clone()).unwrap()
+    };
+    assert!(told(&guest).obstacles.is_empty());
+    let floor = Plane { point: [0.0, -1.0, 0.0], ..Plane::GROUND };
+    let mut state = host.world_mut().get_mut::<BodyState>(body).unwrap();
+    state.body_mut().set_obstacles(vec![Arc::new(floor)]).unwrap();
+    state.body_mut().set_friction(0.3).unwrap();
+    run_until(&mut [&mut host, &mut guest], "the guest knows the floor", |apps| {
+        let around = told(apps[1]);
+        must!(around.obstacles == [floor.fixed().unwrap()] && around.friction == 0.3, "{around:?}");
+        Ok(())
+    });
+}
 
 #[test]
 fn a_guest_sees_how_the_hosts_body_rides() {

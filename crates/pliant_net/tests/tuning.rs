@@ -9,8 +9,10 @@ use std::time::Duration;
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalBody, VisualState};
+use pliant_net::transport::Limits;
 use pliant_net::{
-    BodyArrived, BodyLeft, GuestState, HandOf, HostConfig, JoinConfig, NetGuest, NetHost, UserLeft,
+    BodyArrived, BodyLeft, HandOf, HostConfig, JoinConfig, JoinOptions, NetHost, SessionClosed,
+    SessionCommands, SessionFailed, SessionLost, SessionState, UserLeft,
 };
 use pliant_stream::DisconnectReason;
 use support::{
@@ -18,10 +20,11 @@ use support::{
 };
 
 fn closed(app: &App) -> Option<DisconnectReason> {
-    match app.world().resource::<NetGuest>().state() {
-        GuestState::Closed { reason } => Some(*reason),
-        _ => None,
-    }
+    messages::<SessionClosed>(app).last().map(|closed| closed.reason)
+}
+
+fn state(app: &App) -> SessionState {
+    *app.world().resource::<SessionState>()
 }
 
 #[test]
@@ -75,7 +78,7 @@ fn a_guest_that_leaves_is_gone_at_once_and_does_not_come_back() {
     let (mut host, invite, _) = host(HostConfig::default());
     let mut guest = guest(&invite, JoinConfig::default());
     let there = arrival(&mut host, &mut guest);
-    guest.world_mut().resource_mut::<NetGuest>().leave();
+    guest.world_mut().commands().leave_session();
     run_until(&mut [&mut host, &mut guest], "both ends know", |apps| {
         closed(apps[1]).is_some() && !messages::<UserLeft>(apps[0]).is_empty()
     });
@@ -87,22 +90,29 @@ fn a_guest_that_leaves_is_gone_at_once_and_does_not_come_back() {
     run_until(&mut [&mut host, &mut other, &mut guest], "another one joins", |apps| body_of(apps[1]));
     run_frames(&mut [&mut host, &mut other, &mut guest], 100);
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
-    assert_eq!(closed(&guest), Some(DisconnectReason::Left));
-    assert!(guest.world().get_entity(there).is_ok(), "the body stands as it was last seen");
+    assert_eq!((closed(&guest), state(&guest)), (Some(DisconnectReason::Left), SessionState::Idle));
+    assert!(guest.world().get_entity(there).is_err(), "the session's body is gone");
 }
 
 #[test]
 fn a_host_that_ends_its_session_sends_everybody_away_and_lets_nobody_in() {
     let _alone = alone();
     let (mut host, invite, body) = host(HostConfig::default());
-    let join = || JoinConfig { rejoin: Duration::ZERO, ..JoinConfig::default() };
-    let mut guest = support::guest(&invite, join());
+    let mut guest = support::guest(&invite, JoinConfig::default());
     arrival(&mut host, &mut guest);
-    host.world_mut().resource_mut::<NetHost>().end();
-    assert!(host.world().resource::<NetHost>().has_ended());
-    run_until(&mut [&mut host, &mut guest], "the guest is away", |apps| closed(apps[1]).is_some());
-    let mut late = support::guest(&invite, join());
-    run_until(&mut [&mut host, &mut late], "the next one is refused", |apps| closed(apps[1]).is_some());
-    assert_eq!(host.world().resource::<NetHost>().guests().count(), 0);
+    host.world_mut().commands().leave_session();
+    // The goodbye of the session says that nobody is to wait for this host, unlike the end of the
+    // connection.
+    run_until(&mut [&mut host, &mut guest], "the guest is away", |apps| closed(apps[1]));
+    assert_eq!((closed(&guest), state(&guest)), (Some(DisconnectReason::Left), SessionState::Idle));
+    assert!(messages::<SessionLost>(&guest).is_empty());
+    let limits = Limits { handshake: Duration::from_secs(1), ..Limits::guest() };
+    let transport = JoinOptions { limits, ..JoinOptions::default() };
+    let config = JoinConfig { rejoin: Duration::ZERO, transport, ..JoinConfig::default() };
+    let mut late = support::guest(&invite, config);
+    run_until(&mut [&mut host, &mut late], "the next one does not get in", |apps| {
+        !messages::<SessionFailed>(apps[1]).is_empty()
+    });
+    assert_eq!((state(&host), state(&late)), (SessionState::Idle, SessionState::Idle));
     assert!(host.world().get::<BodyState>(body).is_some(), "its body goes on");
 }

@@ -314,7 +314,8 @@ fn the_stop_and_the_force_of_a_device_are_its_own() {
 #[cfg(feature = "net")]
 mod session {
     use pliant_net::{
-        Emulation, GuestState, HostConfig, JoinConfig, NetGuest, NetHost, NetPlugin, emulator::Preset,
+        Emulation, GuestState, HostConfig, JoinConfig, NetGuest, NetHost, NetPeer, NetPlugin, PeerConfig,
+        SessionState, emulator::Preset,
     };
 
     use super::*;
@@ -359,7 +360,8 @@ mod session {
         choose(&mut shown, "none");
         assert_eq!(emulation(&shown), None);
         click(&mut shown, "End the session");
-        assert!(shown.state().world().resource::<NetHost>().has_ended());
+        shown.run_steps(3);
+        assert!(shown.state().world().get_resource::<NetHost>().is_none());
         assert!(shown.query_by_label("End the session").is_none());
     }
 
@@ -382,6 +384,28 @@ mod session {
         });
         click(&mut shown, "Leave");
         shown.run_steps(3);
-        assert!(matches!(state(&shown), GuestState::Closed { .. }), "{:?}", state(&shown));
+        assert_eq!(session(&shown), SessionState::Idle);
+        assert!(shown.state().world().get_resource::<NetGuest>().is_none());
+        assert!(shown.query_by_label("Leave").is_none());
+    }
+
+    #[test]
+    fn a_peer_leaves() {
+        let peer = NetPlugin::peer(PeerConfig::default()).unwrap();
+        let mut shown = show(app(|app| {
+            app.add_plugins(peer);
+        }));
+        shown.run_steps(3);
+        // Without a body the first peer waits for one.
+        assert_eq!(session(&shown), SessionState::Joining);
+        click(&mut shown, "Leave");
+        shown.run_steps(3);
+        assert_eq!(session(&shown), SessionState::Idle);
+        assert!(shown.state().world().get_resource::<NetPeer>().is_none());
+        assert!(shown.query_by_label("Leave").is_none());
+    }
+
+    fn session(shown: &Shown) -> SessionState {
+        *shown.state().world().resource::<SessionState>()
     }
 }

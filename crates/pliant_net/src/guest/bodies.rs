@@ -9,6 +9,7 @@ use pliant_stream::{BodyId, Placement, StepSettings};
 
 use super::{Interest, NetGuest};
 use crate::remote::{BodyArrived, BodyLeft, RemoteBody, RemoteHands};
+use crate::session::give_back;
 use crate::session_transform::transform_of;
 use crate::shared_body::SharedBody;
 use crate::view::BodyDisplay;
@@ -19,6 +20,8 @@ pub(super) struct FollowedBody {
     /// Whether this plugin spawned the entity. Such an entity is despawned with the body and gets
     /// the host's transform.
     made_here: bool,
+    /// The body that an entity of the app had before the session.
+    before: Option<ModalBody>,
     pub(super) name: String,
     pub(super) display: BodyDisplay,
     /// Largest size of the state so far, the scale of the visual state's offset.
@@ -58,8 +61,8 @@ impl NetGuest {
             return;
         };
         let followed = self.bodies.get(&id).filter(|followed| world.get_entity(followed.entity).is_ok());
-        let (entity, made_here) = match followed {
-            Some(followed) => (followed.entity, followed.made_here),
+        let (entity, made_here, before) = match followed {
+            Some(followed) => (followed.entity, followed.made_here, followed.before.clone()),
             None => {
                 let mut waiting = world.query_filtered::<(Entity, &SharedBody), Without<RemoteBody>>();
                 let waiting =
@@ -67,13 +70,15 @@ impl NetGuest {
                 match waiting {
                     Some(entity) => {
                         // The entity may have tracked a body of the lost session.
-                        let before = self.orphans.iter().position(|orphan| orphan.entity == entity);
-                        let before = before.map(|index| self.orphans.swap_remove(index));
-                        (entity, before.is_some_and(|before| before.made_here))
+                        let orphan = self.orphans.iter().position(|orphan| orphan.entity == entity);
+                        match orphan.map(|index| self.orphans.swap_remove(index)) {
+                            Some(orphan) => (entity, orphan.made_here, orphan.before),
+                            None => (entity, false, world.get::<ModalBody>(entity).cloned()),
+                        }
                     }
                     None => {
                         let transform = transform_of(placement.unwrap_or_default());
-                        (world.spawn((SharedBody::named(name.clone()), transform)).id(), true)
+                        (world.spawn((SharedBody::named(name.clone()), transform)).id(), true, None)
                     }
                 }
             }
@@ -99,6 +104,7 @@ impl NetGuest {
             FollowedBody {
                 entity,
                 made_here,
+                before,
                 name: name.clone(),
                 display: BodyDisplay::default(),
                 peak: 0.0,
@@ -140,6 +146,31 @@ impl NetGuest {
     /// Removes the bodies that the session does not have after a reconnect.
     pub(super) fn forget_orphans(&mut self, world: &mut World) {
         for followed in std::mem::take(&mut self.orphans) {
+            Self::take_leave(world, followed);
+        }
+    }
+
+    /// Gives all bodies back to the app, which leaves the session. Entities that this plugin has
+    /// spawned are despawned.
+    pub(super) fn give_back_bodies(&mut self, world: &mut World) {
+        self.orphan_bodies(world);
+        for mut followed in std::mem::take(&mut self.orphans) {
+            let (entity, before) = (followed.entity, followed.before.take());
+            if !followed.made_here {
+                match before {
+                    Some(before) => {
+                        if let Ok(mut entity) = world.get_entity_mut(entity) {
+                            entity.insert(before);
+                        }
+                        give_back(world, entity);
+                    }
+                    None => {
+                        if let Ok(mut entity) = world.get_entity_mut(entity) {
+                            entity.remove::<(ModalBody, Driven)>();
+                        }
+                    }
+                }
+            }
             Self::take_leave(world, followed);
         }
     }

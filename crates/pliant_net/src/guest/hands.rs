@@ -4,12 +4,12 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabOf};
+use pliant_body::{BodyState, Grab, GrabOf, Impulse};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, GuestSession};
+use pliant_stream::{BodyId, GuestSession, StreamError};
 
 use super::NetGuest;
-use crate::own_grab::{HandSession, OwnGrab, send_grabs};
+use crate::own_grab::{self, HandSession, OwnGrab, send_grabs};
 use crate::remote::RemoteBody;
 
 /// A local grab and what of it was sent to the host.
@@ -24,17 +24,24 @@ pub(super) struct SentGrab {
     tick: u64,
 }
 
-/// `PostUpdate`: sends the app's own grabs on the session's bodies to the host.
+/// `PostUpdate`: sends the app's own grabs and impulses on the session's bodies to the host.
 pub(crate) fn send_hands(
     guest: Option<ResMut<NetGuest>>,
     bodies: Query<(&RemoteBody, &BodyState, &GlobalTransform)>,
     grabs: Query<(Entity, &Grab, &GrabOf)>,
+    mut impulses: MessageReader<Impulse>,
 ) {
     let Some(mut guest) = guest else { return };
     let guest = &mut *guest;
     let now = guest.now();
-    let Some(session) = guest.session.as_mut().filter(|session| session.user().is_some()) else { return };
     let body_of = |entity| bodies.get(entity).ok().map(|(body, state, transform)| (body.0, state, transform));
+    own_grab::send_impulses(&mut impulses, &mut guest.refused_impulses, body_of, |body, vertex, impulse| {
+        let needed = "a session";
+        let none = StreamError::State { what: "apply_impulse", state: "not in", needed };
+        let session = guest.session.as_mut().ok_or(none)?;
+        session.apply_impulse(now, body, vertex, impulse)
+    });
+    let Some(session) = guest.session.as_mut().filter(|session| session.user().is_some()) else { return };
     send_grabs(&mut GuestHands { session, now }, &mut guest.grabs, &grabs, body_of);
 }
 

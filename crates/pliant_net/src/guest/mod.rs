@@ -11,10 +11,12 @@ mod source;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use bevy::platform::time::Instant;
 use bevy::prelude::*;
 use bevy::tasks::Task;
+use pliant_body::BodyRefused;
 use pliant_modal::ModalModel;
 use pliant_stream::{
     BodyId, DisconnectReason, GuestSession, LinkStats, PeerId, RecoveryConfig, State, StreamedBody, Tick,
@@ -24,7 +26,7 @@ use pliant_stream::{
 use crate::metrics::{Ledger, NetStats};
 use crate::remote::RemoteBody;
 use crate::roster::Roster;
-use crate::transport::{Emulation, Endpoint, JoinOptions, Role};
+use crate::transport::{Carrier, Emulation, Endpoint, JoinOptions, Role};
 use bodies::FollowedBody;
 use hands::SentGrab;
 use source::Source;
@@ -42,7 +44,8 @@ use crate::recording::{RecordingError, SessionRecorder, SessionRecording};
 pub struct JoinConfig {
     /// Name of this user, at most 64 bytes. Default: `guest`.
     pub name: String,
-    /// Key, limits, emulated link.
+    /// Key, limits, emulated link. Over a carrier of the app's own only
+    /// [`Limits::idle_timeout`](crate::transport::Limits::idle_timeout) is used.
     pub transport: JoinOptions,
     /// How loss is repaired. Default: [`RecoveryConfig::default`].
     pub recovery: RecoveryConfig,
@@ -51,7 +54,7 @@ pub struct JoinConfig {
     /// Whether to show the local hands, and report their forces, without the network's delay. A
     /// body that this guest holds is then stepped ahead to the current positions of the hands,
     /// instead of shown in the host's state of half a round trip ago. Default: true.
-    pub predict_own_hand: bool,
+    pub predict_hand: bool,
     /// Largest force on one of the local hands that is reported, N, whatever the host sends. The
     /// direction is kept. Default: 1000.
     pub most_force: f64,
@@ -76,7 +79,7 @@ impl Default for JoinConfig {
             transport: JoinOptions::default(),
             recovery: RecoveryConfig::default(),
             modes: None,
-            predict_own_hand: true,
+            predict_hand: true,
             most_force: 1000.0,
             interest: None,
             rejoin: Duration::from_secs(60),
@@ -123,10 +126,10 @@ pub struct NetGuest {
     orphans: Vec<FollowedBody>,
     users: Roster,
     grabs: BTreeMap<Entity, SentGrab>,
+    /// Impulses of this frame that the session did not take.
+    pub(crate) refused_impulses: Vec<BodyRefused>,
     /// Time up to which the session has been updated.
     advanced: Duration,
-    /// Whether the app has asked to leave the session.
-    leaving: bool,
     /// Since when the cameras see less of a body than is requested.
     less_since: BTreeMap<BodyId, Duration>,
     rejoin: session::Rejoin,
@@ -139,9 +142,9 @@ pub struct NetGuest {
 }
 
 impl NetGuest {
-    pub(crate) fn join(mut config: JoinConfig, endpoint: Endpoint) -> Result<Self, RecordingError> {
+    pub(crate) fn join(mut config: JoinConfig, carrier: Box<dyn Carrier>) -> Result<Self, RecordingError> {
         let recorder = config.record.take().map(|path| SessionRecorder::create(&path)).transpose()?;
-        Ok(Self::new(config, Source::Quic { endpoint, recorder }))
+        Ok(Self::new(config, Source::Live { carrier, recorder }))
     }
 
     pub(crate) fn replay(config: JoinConfig, recording: SessionRecording) -> Self {
@@ -160,8 +163,8 @@ impl NetGuest {
             orphans: Vec::new(),
             users: Roster::default(),
             grabs: BTreeMap::new(),
+            refused_impulses: Vec::new(),
             advanced: Duration::ZERO,
-            leaving: false,
             less_since: BTreeMap::new(),
             rejoin: session::Rejoin::default(),
             scratch: Vec::new(),
@@ -201,11 +204,10 @@ impl NetGuest {
         visual_state_of(view)
     }
 
-    /// Leaves the session. The host receives a goodbye, the connection is closed, and the guest
-    /// does not join again. The state is [`GuestState::Closed`] from the next frame on, and bodies
-    /// keep their last displayed state.
-    pub fn leave(&mut self) {
-        self.leaving = true;
+    /// Whether there is a link that [`set_emulation`](Self::set_emulation) changes: neither in a
+    /// replay nor over a carrier of the app's own.
+    pub fn may_emulate(&self) -> bool {
+        self.source.endpoint().is_some()
     }
 
     /// Returns the emulated link under the session, if there is one.
@@ -220,9 +222,24 @@ impl NetGuest {
         }
     }
 
-    /// Returns the transport endpoint. `None` for a replay.
+    /// Returns the QUIC endpoint. `None` for a replay, and over a carrier of the app's own.
     pub fn endpoint(&self) -> Option<&Endpoint> {
         self.source.endpoint()
+    }
+
+    /// Returns whether this is a recorded session.
+    pub fn is_replay(&self) -> bool {
+        self.source.is_replay()
+    }
+
+    /// Returns whether the guest has been in the session.
+    pub(crate) fn was_in(&self) -> bool {
+        self.rejoin.was_in
+    }
+
+    /// Ends the connection, without waiting for its goodbye.
+    pub(crate) fn end_connection(&self) {
+        self.source.end();
     }
 
     fn now(&self) -> Duration {

@@ -11,9 +11,10 @@ use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, Use
 
 use super::source::Came;
 use super::{GuestState, NetGuest};
-use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
+use crate::remote::{GrabRefused, SessionJoined, SessionLost};
 use crate::retry::Retry;
-use crate::transport::{Endpoint, Fingerprint};
+use crate::session::{SessionEvent, tell};
+use crate::transport::Fingerprint;
 use crate::user::shortened;
 
 /// What a guest remembers of earlier connections to its host.
@@ -21,7 +22,7 @@ use crate::user::shortened;
 pub(super) struct Rejoin {
     retry: Retry,
     /// Whether the guest has been in the session before.
-    was_in: bool,
+    pub(super) was_in: bool,
     /// Bodies that have not arrived again by this time are removed.
     orphans_until: Option<Duration>,
 }
@@ -29,16 +30,10 @@ pub(super) struct Rejoin {
 /// How long after the welcome a body may take to arrive again, before it is removed.
 const ORPHANS: Duration = Duration::from_secs(5);
 
-/// `PreUpdate`: processes the data from the host.
+/// Processes the data from the host.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut guest: Mut<NetGuest>| {
         let guest = &mut *guest;
-        if std::mem::take(&mut guest.leaving) {
-            if let Some(session) = &mut guest.session {
-                session.leave();
-            }
-            guest.close(world, DisconnectReason::Left);
-        }
         loop {
             let now = guest.now();
             let Some(came) = guest.source.poll(guest.began, now) else { break };
@@ -84,7 +79,7 @@ impl NetGuest {
             name: shortened(&self.config.name).to_owned(),
             recovery: self.config.recovery,
             modes: self.config.modes,
-            predict_own_hand: self.config.predict_own_hand,
+            predict_hand: self.config.predict_hand,
             idle_timeout: self.config.transport.limits.idle_timeout,
             models_apart: true,
             ..pliant_stream::GuestSessionConfig::default()
@@ -153,7 +148,7 @@ impl NetGuest {
     /// Stops the bodies and schedules the next attempt to join, when the host is lost.
     fn lost(&mut self, world: &mut World, now: Duration, reason: DisconnectReason) {
         self.rejoin.orphans_until = None;
-        let key = self.source.endpoint().map_or(Fingerprint([0; 32]), Endpoint::fingerprint);
+        let key = self.source.fingerprint().unwrap_or(Fingerprint([0; 32]));
         if !self.rejoin.retry.schedule(now, self.config.rejoin, key) {
             return self.close(world, reason);
         }
@@ -165,7 +160,7 @@ impl NetGuest {
         info!("lost the connection to the host, trying again: {reason}");
         if matches!(self.state, GuestState::In { .. }) {
             self.leave_session(world);
-            world.write_message(SessionLost { reason });
+            tell(world, SessionEvent::Lost(SessionLost { reason }));
         }
         self.state = GuestState::Lost { reason };
     }
@@ -198,7 +193,23 @@ impl NetGuest {
         self.source.close();
         self.state = GuestState::Closed { reason };
         self.leave_session(world);
-        world.write_message(SessionClosed { reason });
+        tell(world, SessionEvent::over(self.rejoin.was_in, reason));
+    }
+
+    /// Leaves the session as the app has asked. The host receives a goodbye, and the bodies are the
+    /// app's again, or gone.
+    pub(crate) fn end(&mut self, world: &mut World) {
+        if let Some(session) = &mut self.session {
+            session.leave();
+        }
+        if self.rejoin.was_in {
+            self.close(world, DisconnectReason::Left);
+        } else {
+            // An attempt that is given up is no failure.
+            self.flush();
+        }
+        self.source.end();
+        self.give_back_bodies(world);
     }
 
     fn take_events(&mut self, world: &mut World) {
@@ -253,6 +264,6 @@ impl NetGuest {
         for info in others.filter(|info| info.user != user) {
             self.users.meet(world, info.user, &info.name, info.role);
         }
-        world.write_message(SessionJoined { user, reconnected });
+        tell(world, SessionEvent::Joined(SessionJoined { user, reconnected }));
     }
 }

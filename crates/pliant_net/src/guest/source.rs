@@ -1,19 +1,20 @@
-//! Source of a guest's session: a host over QUIC, or a recording of one.
+//! Source of a guest's session: a host over a carrier, or a recording of one.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use bevy::platform::time::Instant;
 use bytes::Bytes;
 use pliant_modal::ModalModel;
 use pliant_stream::{Channel, DisconnectReason, Output, PeerId};
 use tracing::debug;
 
 use crate::recording::{SessionRecord, SessionRecorder, SessionRecording};
-use crate::transport::{Endpoint, Event, PeerStats, Role};
+use crate::transport::{Carrier, Endpoint, Event, Fingerprint, PeerStats, Role, quic};
 
 /// The guest's transport source.
 pub(crate) enum Source {
-    Quic { endpoint: Endpoint, recorder: Option<SessionRecorder> },
+    Live { carrier: Box<dyn Carrier>, recorder: Option<SessionRecorder> },
     Replay { recording: SessionRecording, max_datagram: usize, over: bool },
 }
 
@@ -33,10 +34,10 @@ impl Source {
     /// Returns the next event that arrived by `now`. `now` and the event's time count from `began`.
     pub(crate) fn poll(&mut self, began: Instant, now: Duration) -> Option<Came> {
         match self {
-            Self::Quic { endpoint, recorder } => {
-                let (came, at, record) = match endpoint.poll()? {
+            Self::Live { carrier, recorder } => {
+                let (came, at, record) = match carrier.poll()? {
                     Event::Connected { peer, role, .. } => {
-                        let most = endpoint.max_datagram_size(peer).unwrap_or(0);
+                        let most = carrier.max_datagram_size(peer).unwrap_or(0);
                         let max_datagram = u16::try_from(most).unwrap_or(u16::MAX);
                         (Came::Connected { role }, now, SessionRecord::Connected { role, max_datagram })
                     }
@@ -81,11 +82,11 @@ impl Source {
     }
 
     pub(crate) fn send(&self, output: Output) {
-        let Self::Quic { endpoint, .. } = self else { return };
+        let Self::Live { carrier, .. } = self else { return };
         // A host that does not read these few messages is lost, which the idle timeout will report.
         let sent = match output.channel {
-            Channel::Datagram => endpoint.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)),
-            Channel::Message => endpoint.send_message(PeerId::HOST, Bytes::from_owner(output.bytes)),
+            Channel::Datagram => carrier.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)),
+            Channel::Message => carrier.send_message(PeerId::HOST, Bytes::from_owner(output.bytes)),
         };
         if let Err(error) = sent {
             debug!("not sent to the host: {error}");
@@ -94,7 +95,7 @@ impl Source {
 
     /// Adds a cached model that the session uses to the recording, because the host never sends it.
     pub(crate) fn keep_model(&mut self, now: Duration, model: &Arc<ModalModel>) {
-        if let Self::Quic { recorder: Some(recorder), .. } = self {
+        if let Self::Live { recorder: Some(recorder), .. } = self {
             recorder.put_model(now, model);
         }
     }
@@ -103,16 +104,24 @@ impl Source {
         matches!(self, Self::Replay { .. })
     }
 
+    /// Returns the own key. A recording has none.
+    pub(crate) fn fingerprint(&self) -> Option<Fingerprint> {
+        match self {
+            Self::Live { carrier, .. } => Some(carrier.fingerprint()),
+            Self::Replay { .. } => None,
+        }
+    }
+
     pub(crate) fn endpoint(&self) -> Option<&Endpoint> {
         match self {
-            Self::Quic { endpoint, .. } => Some(endpoint),
+            Self::Live { carrier, .. } => quic(&**carrier),
             Self::Replay { .. } => None,
         }
     }
 
     pub(crate) fn max_datagram_size(&self) -> Option<usize> {
         match self {
-            Self::Quic { endpoint, .. } => endpoint.max_datagram_size(PeerId::HOST),
+            Self::Live { carrier, .. } => carrier.max_datagram_size(PeerId::HOST),
             Self::Replay { max_datagram, .. } => Some(*max_datagram),
         }
     }
@@ -120,20 +129,27 @@ impl Source {
     /// Returns the connection's metrics. A recording has none of its own.
     pub(crate) fn stats(&self) -> Option<PeerStats> {
         match self {
-            Self::Quic { endpoint, .. } => endpoint.stats(PeerId::HOST),
+            Self::Live { carrier, .. } => carrier.stats(PeerId::HOST),
             Self::Replay { over, .. } => (!over).then(PeerStats::default),
         }
     }
 
     pub(crate) fn close(&self) {
-        if let Self::Quic { endpoint, .. } = self {
-            endpoint.close(PeerId::HOST, DisconnectReason::Left);
+        if let Self::Live { carrier, .. } = self {
+            carrier.close(PeerId::HOST, DisconnectReason::Left);
+        }
+    }
+
+    /// Ends the connection for good, and leaves its port.
+    pub(crate) fn end(&self) {
+        if let Self::Live { carrier, .. } = self {
+            carrier.end();
         }
     }
 
     pub(crate) fn rejoin(&self) {
-        if let Self::Quic { endpoint, .. } = self {
-            endpoint.rejoin();
+        if let Self::Live { carrier, .. } = self {
+            carrier.rejoin();
         }
     }
 }

@@ -18,21 +18,22 @@ pub(super) struct Guest {
     pub(super) entity: Option<Entity>,
 }
 
-/// `PreUpdate`: processes the data from the guests.
+/// Processes the data from the guests.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut host: Mut<NetHost>| {
         let host = &mut *host;
-        let frame: Vec<Event> = host.endpoint.frame().collect();
+        host.carrier.begin_frame();
+        let frame: Vec<Event> = std::iter::from_fn(|| host.carrier.poll_in_frame()).collect();
         for event in frame {
             let now = host.now();
             match event {
                 Event::Connected { peer, address, fingerprint, role } => {
-                    debug!("guest {peer} from {address} with key {fingerprint}");
+                    debug!("guest {peer} from {address:?} with key {fingerprint}");
                     host.guests.insert(peer, Guest { key: fingerprint, role, entity: None });
-                    let most = host.endpoint.max_datagram_size(peer).unwrap_or(0);
+                    let most = host.carrier.max_datagram_size(peer).unwrap_or(0);
                     if let Err(error) = host.session.connect(now, peer, most) {
                         debug!("guest {peer}: {error}");
-                        host.endpoint.close(peer, DisconnectReason::Full);
+                        host.carrier.close(peer, DisconnectReason::Full);
                     }
                 }
                 Event::Datagram { peer, at, bytes } => {
@@ -51,8 +52,8 @@ pub(crate) fn receive(world: &mut World) {
             // the oldest, and one guest's flood must not drop another guest's goodbye.
             host.take_events(world);
         }
-        for peer in host.endpoint.peers() {
-            if let Some(most) = host.endpoint.max_datagram_size(peer) {
+        for peer in host.carrier.peers() {
+            if let Some(most) = host.carrier.max_datagram_size(peer) {
                 host.session.set_max_datagram(peer, most);
             }
         }
@@ -61,7 +62,7 @@ pub(crate) fn receive(world: &mut World) {
 }
 
 impl NetHost {
-    fn take_events(&mut self, world: &mut World) {
+    pub(super) fn take_events(&mut self, world: &mut World) {
         while let Some(event) = self.session.poll_event() {
             self.apply(world, event);
         }
@@ -117,7 +118,7 @@ impl NetHost {
                 // The session's goodbye is more precise than the end of the connection, so it is
                 // sent first.
                 self.flush();
-                self.endpoint.close(peer, reason);
+                self.carrier.close(peer, reason);
                 let guest = self.guests.get_mut(&peer);
                 let inside = guest.and_then(|guest| guest.entity.take().map(|_| guest.key));
                 if let Some((id, key)) = user.zip(inside) {
@@ -137,6 +138,11 @@ impl NetHost {
                 let grab = self.grabs.get(&key).and_then(|&entity| world.get_mut::<GuestGrab>(entity));
                 if let Some(mut grab) = grab {
                     grab.hand.take(input, hands, target.to_array().into());
+                }
+            }
+            HostEvent::Impulse { user, body, vertex, impulse } => {
+                if let Err(why) = self.take_impulse(world, user, body, vertex, impulse) {
+                    debug!("an impulse of user {} is ignored: {why}", user.0);
                 }
             }
             HostEvent::GrabEnded { key, .. } => {

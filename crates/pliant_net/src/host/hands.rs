@@ -2,9 +2,9 @@
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabOf, Grabs};
+use pliant_body::{BodyState, Grab, GrabOf, Grabs, Impulse};
 use pliant_modal::{Body, GrabConfig};
-use pliant_stream::{BodyId, GrabKey, HandPlayout, PeerId};
+use pliant_stream::{BodyId, GrabKey, HandPlayout, PeerId, UserId};
 
 use super::NetHost;
 use crate::session_transform::SessionTransform;
@@ -80,7 +80,6 @@ impl NetHost {
         if !(0.0..=model.size()).contains(&radius) {
             return Err("its radius is larger than the body");
         }
-        let holding = world.get::<Holding>(entity).copied().unwrap_or(self.holding);
         let held = world.get::<Grabs>(entity).map(|grabs| grabs.entities().to_vec()).unwrap_or_default();
         let others = |other: &Entity| world.get::<HandOf>(*other).is_none_or(|hand| hand.0 != user);
         // A grab without a place on the body would wait, and its guest would not know why it holds
@@ -94,12 +93,7 @@ impl NetHost {
         if own >= free {
             return Err("the places that are left are for others");
         }
-        match holding {
-            Holding::Together => {}
-            Holding::OneAtATime if held.iter().any(others) => return Err("somebody else holds the body"),
-            Holding::OneAtATime => {}
-            Holding::HostOnly => return Err("only the host may hold the body"),
-        }
+        self.may_hold(world, entity, user)?;
         let GrabConfig { stiffness, relaxation } = hold;
         let size = world.get::<GlobalTransform>(entity).map_or(1.0, |place| f64::from(place.scale().x))
             * model.size();
@@ -113,6 +107,36 @@ impl NetHost {
             ))
             .id();
         self.grabs.insert(key, spawned);
+        Ok(())
+    }
+
+    /// Whether a guest's hand may be on a body, and its impulses may act on it.
+    fn may_hold(&self, world: &World, body: Entity, user: Entity) -> Result<(), &'static str> {
+        let held = world.get::<Grabs>(body).map_or(&[][..], |grabs| grabs.entities());
+        let others = |other: &Entity| world.get::<HandOf>(*other).is_none_or(|hand| hand.0 != user);
+        match world.get::<Holding>(body).copied().unwrap_or(self.holding) {
+            Holding::OneAtATime if held.iter().any(others) => Err("somebody else holds the body"),
+            Holding::HostOnly => Err("only the host may hold the body"),
+            Holding::Together | Holding::OneAtATime => Ok(()),
+        }
+    }
+
+    /// Passes a guest's impulse (N s, session coordinates) to the next tick.
+    pub(super) fn take_impulse(
+        &self,
+        world: &mut World,
+        user: UserId,
+        body: BodyId,
+        vertex: u32,
+        impulse: [f64; 3],
+    ) -> Result<(), &'static str> {
+        let body = self.entity_of(body).ok_or("no such body")?;
+        let user = self.users.get(user).ok_or("no such user")?;
+        self.may_hold(world, body, user)?;
+        let state = world.get::<BodyState>(body).ok_or("the body is not ready")?;
+        let transform = world.get::<GlobalTransform>(body).ok_or("the body has no place")?;
+        let place = SessionTransform::of_body(transform, state).ok_or("the body has no place")?;
+        world.write_message(Impulse { body, vertex, impulse: place.force_to_world(impulse) });
         Ok(())
     }
 }

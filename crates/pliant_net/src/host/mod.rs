@@ -4,11 +4,13 @@
 mod guests;
 mod hands;
 mod publish;
+mod surroundings;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use bevy::platform::time::Instant;
 use bevy::prelude::*;
 use bevy::tasks::Task;
 use bytes::Bytes;
@@ -18,8 +20,9 @@ use pliant_stream::{Channel, DisconnectReason, GrabKey, GrabState, HostSession, 
 use crate::known_users::KnownUsers;
 use crate::metrics::{Ledger, NetStats};
 use crate::roster::Roster;
+use crate::session::{SessionEvent, tell};
 use crate::transport::{
-    Access, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError,
+    Access, Carrier, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError, quic,
 };
 use crate::user::shortened;
 use guests::Guest;
@@ -35,7 +38,7 @@ pub(crate) use publish::{finish, publish};
 pub struct HostConfig {
     /// Name of the user at the host, at most 64 bytes. Guests see it. Default: `host`.
     pub name: String,
-    /// Socket, key, who may join, limits, emulated link.
+    /// Socket, key, who may join, limits, emulated link. Not used over a carrier of the app's own.
     pub transport: HostOptions,
     /// The session's settings. The step is always that of `Time<Fixed>`. [`HostOptions::access`]
     /// determines who may join.
@@ -75,8 +78,7 @@ impl Default for HostConfig {
 /// The session that this app hosts.
 #[derive(Resource)]
 pub struct NetHost {
-    endpoint: Endpoint,
-    ended: bool,
+    carrier: Box<dyn Carrier>,
     began: Instant,
     session: HostSession,
     holding: Holding,
@@ -101,7 +103,7 @@ pub struct NetHost {
 impl NetHost {
     pub(crate) fn start(
         world: &mut World,
-        endpoint: Endpoint,
+        carrier: Box<dyn Carrier>,
         config: &HostConfig,
     ) -> Result<(), pliant_stream::StreamError> {
         // The host app admits each guest itself, because the key of the connection determines the
@@ -111,16 +113,19 @@ impl NetHost {
             settings.newmark.h = fixed.timestep().as_secs_f64();
         }
         let mut session = HostSession::new(settings)?;
-        let invite = endpoint.invite();
-        info!("hosting at {}:{} with key {}", invite.host, invite.port, invite.fingerprint);
+        match quic(&*carrier).map(Endpoint::invite) {
+            Some(invite) => {
+                info!("hosting at {}:{} with key {}", invite.host, invite.port, invite.fingerprint);
+            }
+            None => info!("hosting over the app's own carrier"),
+        }
         let name = shortened(&config.name);
         session.set_host_user(name)?;
         let mut users = Roster::default();
         users.meet_yourself(world, UserId::HOST, name, Role::Hold);
         let reach = if config.reach.is_finite() { config.reach.clamp(0.0, 1e3) } else { 4.0 };
         world.insert_resource(Self {
-            endpoint,
-            ended: false,
+            carrier,
             began: Instant::now(),
             session,
             holding: config.holding,
@@ -142,47 +147,57 @@ impl NetHost {
         Ok(())
     }
 
-    /// Returns the invite for guests, with the first token if there is one.
-    pub fn invite(&self) -> Invite {
-        self.endpoint.invite()
+    /// Returns the invite for guests, with the first token if there is one. `None` over a carrier
+    /// of the app's own, which knows itself how to join.
+    pub fn invite(&self) -> Option<Invite> {
+        self.endpoint().map(Endpoint::invite)
     }
 
     /// Changes who may join from this call on. Connected guests stay connected and keep their
-    /// roles.
+    /// roles. Changes nothing over a carrier of the app's own.
     pub fn set_access(&self, access: Access) {
-        self.endpoint.set_access(access);
+        if let Some(endpoint) = self.endpoint() {
+            endpoint.set_access(access);
+        }
     }
 
-    /// Ends the session. All guests receive a goodbye and are disconnected, and the host admits no
-    /// more guests. The bodies go on in this app.
-    pub fn end(&mut self) {
-        self.ended = true;
-        self.endpoint.set_access(Access::Tokens(Vec::new()));
+    /// Ends the session as the app has asked. All guests receive a goodbye and are disconnected,
+    /// the host admits no more guests, and its port is free. The bodies go on in this app.
+    pub(crate) fn end(&mut self, world: &mut World) {
+        info!("the session is over");
         let peers: Vec<PeerId> = self.guests.keys().copied().collect();
         for peer in peers {
             self.session.kick(peer, DisconnectReason::Left);
+            self.take_events(world);
         }
         self.flush();
+        self.carrier.end();
+        self.users.clear(world);
+        tell(world, SessionEvent::over(true, DisconnectReason::Left));
     }
 
-    /// Returns whether [`end`](Self::end) was called.
-    pub fn has_ended(&self) -> bool {
-        self.ended
+    /// Whether there is a link that [`set_emulation`](Self::set_emulation) changes: not over a
+    /// carrier of the app's own.
+    pub fn may_emulate(&self) -> bool {
+        self.endpoint().is_some()
     }
 
     /// Returns the emulated link under the session, if there is one.
     pub fn emulation(&self) -> Option<Emulation> {
-        self.endpoint.emulation()
+        self.endpoint().and_then(Endpoint::emulation)
     }
 
-    /// Sets, replaces or removes the emulated link under the session, at any time.
+    /// Sets, replaces or removes the emulated link under the session, at any time. Changes nothing
+    /// over a carrier of the app's own.
     pub fn set_emulation(&self, emulation: Option<Emulation>) {
-        self.endpoint.set_emulation(emulation);
+        if let Some(endpoint) = self.endpoint() {
+            endpoint.set_emulation(emulation);
+        }
     }
 
-    /// Returns the transport endpoint.
-    pub fn endpoint(&self) -> &Endpoint {
-        &self.endpoint
+    /// Returns the QUIC endpoint. `None` over a carrier of the app's own.
+    pub fn endpoint(&self) -> Option<&Endpoint> {
+        quic(&*self.carrier)
     }
 
     /// Returns the session, with more details.
@@ -227,14 +242,14 @@ impl NetHost {
         // A model is handed over no faster than the connection sends it.
         let fetching: Vec<PeerId> = self.session.fetching().collect();
         for peer in fetching {
-            self.session.set_unsent(peer, self.endpoint.unsent(peer));
+            self.session.set_unsent(peer, self.carrier.unsent(peer));
         }
         self.session.update(now);
         while let Some(output) = self.session.poll_output() {
             match output.channel {
                 // The transport counts a dropped datagram, and the session repairs the loss.
                 Channel::Datagram => {
-                    let _ = self.endpoint.send_datagram(output.peer, Bytes::from_owner(output.bytes));
+                    let _ = self.carrier.send_datagram(output.peer, Bytes::from_owner(output.bytes));
                 }
                 Channel::Message => self.send_message(output.peer, Bytes::from_owner(output.bytes)),
             }
@@ -244,15 +259,15 @@ impl NetHost {
     /// Sends a message to a guest. A guest that does not read its messages is disconnected, because
     /// it cannot stay in the session without them.
     fn send_message(&mut self, peer: PeerId, message: Bytes) {
-        if let Err(error @ SendError::QueueFull { .. }) = self.endpoint.send_message(peer, message) {
+        if let Err(error @ SendError::QueueFull { .. }) = self.carrier.send_message(peer, message) {
             debug!("guest {peer} is sent away: {error}");
             self.session.disconnect(peer, DisconnectReason::Unread);
-            self.endpoint.close(peer, DisconnectReason::Unread);
+            self.carrier.close(peer, DisconnectReason::Unread);
         }
     }
 
     fn link(&self, peer: PeerId) -> Option<(LinkStats, PeerStats)> {
-        let (mut link, transport) = (self.session.stats(peer)?, self.endpoint.stats(peer)?);
+        let (mut link, transport) = (self.session.stats(peer)?, self.carrier.stats(peer)?);
         // The session measures the round trip on the guest's side only. QUIC measures it on both
         // sides.
         if link.round_trip.is_zero() {
@@ -267,7 +282,7 @@ impl NetHost {
         for (link, transport) in inside.filter_map(|(&peer, _)| self.link(peer)) {
             sum.add(&link, &transport);
         }
-        let open = self.guests.keys().filter_map(|&peer| Some((peer, self.endpoint.stats(peer)?)));
+        let open = self.guests.keys().filter_map(|&peer| Some((peer, self.carrier.stats(peer)?)));
         sum.count(&self.session.totals(), &self.ledger.sum(open));
         sum
     }

@@ -14,6 +14,7 @@ use pliant_stream::{
 
 use super::NetHost;
 use super::hands::GuestGrab;
+use super::surroundings::KnownSurroundings;
 use crate::own_grab::hold_of;
 use crate::session_transform::{SessionTransform, placement_of};
 use crate::shared_body::SharedBody;
@@ -26,6 +27,7 @@ pub(super) struct HostedBody {
     /// When the settings were last sent to the guests.
     settings_sent: Duration,
     pub(super) placed: GlobalTransform,
+    around: KnownSurroundings,
     /// Whether the current fault was logged, so that it is logged only once.
     faulted: bool,
 }
@@ -100,6 +102,12 @@ pub(crate) fn publish(
             }
         }
         let body = state.body();
+        if let Some(hosted) = host.bodies.get_mut(&entity)
+            && let Some(around) = hosted.around.look(now, body)
+            && let Err(error) = host.session.set_surroundings(id, around.clone())
+        {
+            warn_once!("the surroundings of a body are not shared: {error}");
+        }
         let pose = body.model().is_free().then(|| RigidState::of(body));
         let step = TickState {
             tick: tick.0,
@@ -181,6 +189,7 @@ impl NetHost {
                         settings,
                         settings_sent: now,
                         placed: *transform,
+                        around: KnownSurroundings::default(),
                         faulted: false,
                     },
                 );

@@ -11,15 +11,16 @@ use pliant_stream::{Channel, DisconnectReason, PeerId, StreamError, UserId};
 
 use super::reconnect::may_come_back;
 use super::{NetPeer, PeerState};
-use crate::remote::{SessionClosed, SessionJoined};
-use crate::transport::{Endpoint, Event, Fingerprint, Invite, Role};
+use crate::remote::SessionJoined;
+use crate::session::{SessionEvent, give_back, tell};
+use crate::transport::{Event, Fingerprint, Invite, Role, has_called};
 use crate::user::UserLink;
 
 /// Another peer that this peer is connected with.
 #[derive(Debug)]
 pub(super) struct ConnectedPeer {
     pub(super) key: Fingerprint,
-    address: std::net::IpAddr,
+    address: Option<std::net::IpAddr>,
     /// The peer's user number, which this peer assigned or the other peer sent. The session then
     /// uses it.
     pub(super) number: Option<UserId>,
@@ -36,11 +37,12 @@ pub(super) struct ConnectedPeer {
 impl ConnectedPeer {
     /// Replaces the invite's host with the address from which the peer has connected.
     fn seen_from_here(&self, invite: Invite) -> Invite {
-        Invite { host: self.address.to_string(), ..invite }
+        let host = self.address.map_or_else(|| invite.host.clone(), |address| address.to_string());
+        Invite { host, ..invite }
     }
 }
 
-/// `PreUpdate`: processes the data from the peers.
+/// Processes the data from the peers.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut peer: Mut<NetPeer>| {
         let net = &mut *peer;
@@ -49,13 +51,9 @@ pub(crate) fn receive(world: &mut World) {
         }
         net.start(world);
         net.take_events(world);
-        let mut came: Vec<(Option<PeerId>, Event)> = Vec::new();
-        came.extend(net.listening.frame().map(|event| (None, event)));
-        for (&peer, endpoint) in &net.opened {
-            came.extend(endpoint.frame().map(|event| (Some(peer), event)));
-        }
-        for (opened, event) in came {
-            net.take(world, opened, event);
+        net.carrier.begin_frame();
+        while let Some(event) = net.carrier.poll_in_frame() {
+            net.take(world, event);
             // Events are processed at once. The session keeps a limited number of them, and one
             // peer's flood must not drop another peer's goodbye.
             net.take_events(world);
@@ -63,7 +61,6 @@ pub(crate) fn receive(world: &mut World) {
         net.take_events(world);
         net.measure_paths();
         net.hang_up_on_the_silent();
-        net.ending.retain(|thread| !thread.is_finished());
         net.look_for_the_missed();
         net.flush();
     });
@@ -85,8 +82,7 @@ impl NetPeer {
     /// greeted, and of any other peer the first message is awaited.
     fn bring_in(&mut self, peer: PeerId) {
         let now = self.now();
-        let (endpoint, number) = self.way(peer);
-        let (most, opened) = (endpoint.max_datagram_size(number).unwrap_or(0), number != peer);
+        let (most, opened) = (self.carrier.max_datagram_size(peer).unwrap_or(0), has_called(peer));
         let (Some(session), Some(other)) = (&self.session, self.others.get(&peer)) else { return };
         if session.stats(peer).is_some() || !(opened || other.first.is_some()) {
             return;
@@ -118,21 +114,20 @@ impl NetPeer {
         }
     }
 
-    fn take(&mut self, world: &mut World, opened: Option<PeerId>, event: Event) {
+    fn take(&mut self, world: &mut World, event: Event) {
         let now = self.now();
         match event {
             Event::Connected { peer, fingerprint, address, role } => {
-                let peer = opened.unwrap_or(peer);
                 let (number, invite) = self.introduced.remove(&peer).unzip();
-                let address = address.ip();
+                let address = address.map(|address| address.ip());
                 // The peer of this peer's own invite is reached there by others too.
-                let first = opened.is_some() && matches!(self.state, PeerState::Joining);
+                let first = has_called(peer) && matches!(self.state, PeerState::Joining);
                 let invite = invite.or_else(|| self.config.join.clone().filter(|_| first));
                 let (first, since, sent_away) = (None, now, false);
                 let other =
                     ConnectedPeer { key: fingerprint, address, number, invite, first, since, sent_away };
                 self.others.insert(peer, other);
-                if role == Role::Watch && opened.is_none() {
+                if role == Role::Watch && !has_called(peer) {
                     // Every peer steps the bodies with its own hands, so the mesh has no place for
                     // a watcher.
                     return self.hang_up(peer, DisconnectReason::WatchOnly);
@@ -141,27 +136,23 @@ impl NetPeer {
             }
             // The connection only stays open to send this peer's goodbye.
             Event::Datagram { peer, .. } | Event::Message { peer, .. }
-                if self.others.get(&opened.unwrap_or(peer)).is_none_or(|other| other.sent_away) => {}
+                if self.others.get(&peer).is_none_or(|other| other.sent_away) => {}
             Event::Datagram { peer, at, bytes } => {
                 let at = at.saturating_duration_since(self.began);
                 if let Some(session) = &mut self.session {
-                    session.on_datagram(at, opened.unwrap_or(peer), &bytes);
+                    session.on_datagram(at, peer, &bytes);
                 }
             }
-            Event::Message { peer, bytes } => {
-                let peer = opened.unwrap_or(peer);
-                match &mut self.session {
-                    Some(session) if session.stats(peer).is_some() => session.on_message(now, peer, &bytes),
-                    _ => {
-                        if let Some(other) = self.others.get_mut(&peer) {
-                            other.first.get_or_insert(bytes);
-                        }
-                        self.bring_in(peer);
+            Event::Message { peer, bytes } => match &mut self.session {
+                Some(session) if session.stats(peer).is_some() => session.on_message(now, peer, &bytes),
+                _ => {
+                    if let Some(other) = self.others.get_mut(&peer) {
+                        other.first.get_or_insert(bytes);
                     }
+                    self.bring_in(peer);
                 }
-            }
+            },
             Event::Closed { peer, reason } => {
-                let peer = opened.unwrap_or(peer);
                 debug!("peer {peer} is gone: {reason}");
                 self.miss(now, peer, reason);
                 if let Some(session) = &mut self.session {
@@ -173,10 +164,7 @@ impl NetPeer {
                     self.see(other.key, user);
                 }
                 self.introduced.remove(&peer);
-                // The endpoint's thread may wait for the other end's last packets, which must not
-                // block a frame.
-                self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::close_detached));
-                if opened.is_some() && matches!(self.state, PeerState::Joining) {
+                if has_called(peer) && matches!(self.state, PeerState::Joining) {
                     self.close(world, reason);
                 }
             }
@@ -185,18 +173,22 @@ impl NetPeer {
 
     /// Keeps that a peer has come or gone.
     fn see(&mut self, key: Fingerprint, user: UserId) {
-        let own = self.listening.fingerprint();
+        let own = self.carrier.fingerprint();
         let here: BTreeSet<Fingerprint> = self.others.values().map(|other| other.key).chain([own]).collect();
         self.known.see(key, user, |key| here.contains(key));
     }
 
+    /// The peers that are in the session with this one, and where they are reached.
+    pub(super) fn reachable(&self) -> Vec<(UserId, String)> {
+        // Who answers at an address that was told of is nobody before its hello.
+        let Some(session) = &self.session else { return Vec::new() };
+        let here = self.others.iter().filter(|(peer, _)| session.user_of(**peer).is_some());
+        here.filter_map(|(_, other)| Some((other.number?, other.invite.as_ref()?.to_string()))).collect()
+    }
+
     /// Gives a new peer its number and the invites of all other peers.
     fn welcome(&mut self, peer: PeerId) {
-        let others: Vec<(UserId, String)> = self
-            .others
-            .values()
-            .filter_map(|other| Some((other.number?, other.invite.as_ref()?.to_string())))
-            .collect();
+        let others = self.reachable();
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
         let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
         let before = self.known.number_of(&key).filter(|before| !present.contains(before));
@@ -242,7 +234,7 @@ impl NetPeer {
                 debug!("user {} has no invite", number.0);
                 continue;
             };
-            match self.connect_to(&invite) {
+            match self.carrier.call(&invite) {
                 Ok(peer) => {
                     self.introduced.insert(peer, (number, invite));
                 }
@@ -252,10 +244,9 @@ impl NetPeer {
     }
 
     fn send(&self, peer: PeerId, message: Bytes) {
-        let (endpoint, number) = self.way(peer);
-        if let Err(error) = endpoint.send_message(number, message) {
+        if let Err(error) = self.carrier.send_message(peer, message) {
             debug!("not sent to peer {peer}: {error}");
-            endpoint.close(number, DisconnectReason::Unread);
+            self.carrier.close(peer, DisconnectReason::Unread);
         }
     }
 
@@ -279,10 +270,7 @@ impl NetPeer {
     /// Tells the session how large the datagrams of each path may be, which QUIC finds out while it
     /// runs.
     fn measure_paths(&mut self) {
-        let size = |&peer: &PeerId| {
-            let (endpoint, number) = self.way(peer);
-            Some((peer, endpoint.max_datagram_size(number)?))
-        };
+        let size = |&peer: &PeerId| Some((peer, self.carrier.max_datagram_size(peer)?));
         let sizes: Vec<(PeerId, usize)> = self.others.keys().filter_map(size).collect();
         let Some(session) = &mut self.session else { return };
         sizes.into_iter().for_each(|(peer, bytes)| session.set_max_datagram(peer, bytes));
@@ -297,8 +285,7 @@ impl NetPeer {
                 self.take_token(&key);
             }
         }
-        let (endpoint, number) = self.way(peer);
-        endpoint.close(number, reason);
+        self.carrier.close(peer, reason);
         if let Some(session) = &mut self.session {
             session.disconnect(peer, reason);
         }
@@ -311,9 +298,8 @@ impl NetPeer {
         for output in out {
             match output.channel {
                 Channel::Datagram => {
-                    let (endpoint, number) = self.way(output.peer);
                     // A datagram that is not taken is lost. The next one repeats its content.
-                    let _ = endpoint.send_datagram(number, Bytes::from_owner(output.bytes));
+                    let _ = self.carrier.send_datagram(output.peer, Bytes::from_owner(output.bytes));
                 }
                 Channel::Message => self.send(output.peer, Bytes::from_owner(output.bytes)),
             }
@@ -326,7 +312,7 @@ impl NetPeer {
             match event {
                 PeerEvent::Started => {
                     if let PeerState::In { user } = self.state {
-                        world.write_message(SessionJoined { user, reconnected: false });
+                        tell(world, SessionEvent::Joined(SessionJoined { user, reconnected: false }));
                     }
                 }
                 PeerEvent::JoinRequest { peer } => self.welcome(peer),
@@ -338,10 +324,16 @@ impl NetPeer {
                     if !self.keep_joined(peer, user, &address) {
                         continue;
                     }
-                    self.found(user);
+                    self.found(user, peer);
+                    self.refused.remove(&user);
+                    self.introduce();
                     self.users.join(world, user, &name, Role::Hold, false);
                 }
+                PeerEvent::Introduced { peer, others } => self.look_for_introduced(peer, others),
                 PeerEvent::Left { user, reason } => {
+                    if !may_come_back(reason) && reason != DisconnectReason::Left {
+                        self.refused.insert(user);
+                    }
                     if !self.users.leave(world, user, reason) {
                         continue;
                     }
@@ -355,8 +347,7 @@ impl NetPeer {
                         if reason == DisconnectReason::Silent {
                             self.miss(now, peer, reason);
                         }
-                        let (endpoint, number) = self.way(peer);
-                        endpoint.close(number, reason);
+                        self.carrier.close(peer, reason);
                         if let Some(other) = self.others.get_mut(&peer) {
                             (other.number, other.invite, other.sent_away) = (None, None, true);
                             let key = other.key;
@@ -378,9 +369,8 @@ impl NetPeer {
         }
         // QUIC measures the round trip and the outgoing loss of each link.
         for (&peer, other) in &self.others {
-            let (endpoint, number) = self.way(peer);
             let entity = other.number.and_then(|user| self.users.get(user));
-            let (Some(stats), Some(entity)) = (endpoint.stats(number), entity) else { continue };
+            let (Some(stats), Some(entity)) = (self.carrier.stats(peer), entity) else { continue };
             if let Some(mut link) = world.get_mut::<UserLink>(entity) {
                 let (round_trip, loss_out) = (stats.round_trip, stats.loss());
                 let session = self.session.as_ref().and_then(|session| session.stats(peer));
@@ -392,7 +382,19 @@ impl NetPeer {
 
     pub(super) fn close(&mut self, world: &mut World, reason: DisconnectReason) {
         info!("the session is over: {reason}");
+        let inside = matches!(self.state, PeerState::In { .. });
         self.state = PeerState::Closed { reason };
-        world.write_message(SessionClosed { reason });
+        tell(world, SessionEvent::over(inside, reason));
+    }
+
+    /// Leaves the session as the app has asked. The bodies are the app's again, the other peers
+    /// receive a goodbye, and the port is free.
+    pub(crate) fn end(&mut self, world: &mut World) {
+        if matches!(self.state, PeerState::In { .. }) {
+            self.close(world, DisconnectReason::Left);
+        }
+        self.end_connections();
+        self.users.clear(world);
+        self.bodies.values().for_each(|played| give_back(world, played.entity));
     }
 }

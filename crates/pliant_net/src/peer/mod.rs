@@ -6,16 +6,18 @@
 //! stay connected.
 
 mod mesh;
+mod missed;
 mod play;
 mod reconnect;
 mod tokens;
 
-use std::collections::BTreeMap;
-use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::any::Any;
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
+use bevy::platform::time::Instant;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Driven, ModalBody};
+use pliant_body::{BodyRefused, BodyState, Driven, FixedObstacles, ModalBody};
 use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
@@ -24,15 +26,16 @@ use crate::metrics::{Ledger, NetStats};
 use crate::own_grab::OwnGrab;
 use crate::remote::SessionJoined;
 use crate::roster::Roster;
+use crate::session::{SessionEvent, tell};
 use crate::shared_body::SharedBody;
 use crate::transport::{
-    Access, Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats,
-    Role, Token, TransportError,
+    Access, Emulation, Fingerprint, HostOptions, Invite, Limits, MeshCarrier, PeerStats, QuicMesh, Role,
+    Token, TransportError,
 };
 use crate::user::shortened;
 use mesh::ConnectedPeer;
+use missed::Missed;
 use play::PlayedBody;
-use reconnect::Missed;
 
 pub(crate) use mesh::receive;
 pub(crate) use play::{send_hands, show};
@@ -46,7 +49,7 @@ pub struct PeerConfig {
     /// the session.
     pub join: Option<Invite>,
     /// Where this peer listens, its key, who may join through it, limits, and the emulated link on
-    /// all its connections.
+    /// all its connections. Over a carrier of the app's own, only the limits are used.
     pub transport: HostOptions,
     /// How the session corrects for late hands. Default: [`LateInputRepair::Rollback`].
     pub repair: LateInputRepair,
@@ -91,18 +94,15 @@ pub enum PeerState {
 /// begins. All peers must have the same bodies, by name and model. The bodies are
 /// [`Driven::Remote`]: this resource steps them, at the rate of `Time<Fixed>`. A free body begins
 /// in its model's pose, with its weight. An anchored body stays where each app has placed it.
+///
+/// Free bodies touch the floors, balls, boxes and capsules that stand still when the session
+/// begins, which must be the same for all peers, too. They touch them there even if they move
+/// later: leave those out by contact layers. Bodies of peers touch neither meshes nor each other.
 #[derive(Resource)]
 pub struct NetPeer {
-    listening: Endpoint,
-    /// Connections that this peer has opened.
-    opened: BTreeMap<PeerId, Endpoint>,
-    /// Threads of closed connections that are still sending their goodbye. No frame waits for them.
-    ending: Vec<JoinHandle<()>>,
-    /// The private key in PKCS #8 form, which the opened connections use too.
-    key: Vec<u8>,
+    carrier: Box<dyn MeshCarrier>,
     config: PeerConfig,
     limits: Limits,
-    emulation: Option<Emulation>,
     began: Instant,
     /// When this peer was given its number, measured from `began`.
     began_at: Duration,
@@ -116,7 +116,9 @@ pub struct NetPeer {
     /// them.
     introduced: BTreeMap<PeerId, (UserId, Invite)>,
     /// Lost peers that this peer tries to reach.
-    missed: Vec<Missed>,
+    missed: Missed,
+    /// Users with whom the session has ended for good: nobody's introduction leads back to them.
+    refused: BTreeSet<UserId>,
     known: KnownUsers,
     /// Who may join by a token of the application's.
     access: Access,
@@ -125,32 +127,40 @@ pub struct NetPeer {
     tokens: BTreeMap<Fingerprint, Token>,
     users: Roster,
     grabs: BTreeMap<Entity, OwnGrab>,
+    /// Impulses of this frame that the session did not take.
+    pub(crate) refused_impulses: Vec<BodyRefused>,
     scratch: Vec<f64>,
     ledger: Ledger,
-    next_opened: u64,
 }
-
-/// First number of the connections that this peer opens. Connection numbers of the listening socket
-/// never get this large.
-const OPENED: u64 = 1 << 48;
 
 impl NetPeer {
     /// Opens the sockets.
     pub(crate) fn open(mut config: PeerConfig) -> Result<Self, TransportError> {
-        let identity = config.transport.identity.take().map_or_else(Identity::generate, Ok)?;
-        let key = identity.to_pkcs8();
-        let (limits, emulation) = (config.transport.limits.clone(), config.transport.emulation.clone());
-        let access = config.transport.access.clone();
-        let options = HostOptions { identity: Some(identity), ..std::mem::take(&mut config.transport) };
-        let listening = Endpoint::host(options)?;
-        let mut peer = Self {
-            listening,
-            opened: BTreeMap::new(),
-            ending: Vec::new(),
-            key,
+        let (limits, access) = (config.transport.limits.clone(), config.transport.access.clone());
+        let carrier = Box::new(QuicMesh::open(std::mem::take(&mut config.transport))?);
+        Self::over(carrier, config, limits, access)
+    }
+
+    /// Plays over a carrier of the app's own, which decides itself who is admitted.
+    pub(crate) fn open_over(
+        carrier: Box<dyn MeshCarrier>,
+        config: PeerConfig,
+    ) -> Result<Self, TransportError> {
+        let limits = config.transport.limits.clone();
+        Self::over(carrier, config, limits, Access::Anyone)
+    }
+
+    fn over(
+        carrier: Box<dyn MeshCarrier>,
+        config: PeerConfig,
+        limits: Limits,
+        access: Access,
+    ) -> Result<Self, TransportError> {
+        let missed = Missed::new(config.rejoin, carrier.fingerprint());
+        let peer = Self {
+            carrier,
             config,
             limits,
-            emulation,
             began: Instant::now(),
             began_at: Duration::ZERO,
             state: PeerState::Joining,
@@ -159,34 +169,20 @@ impl NetPeer {
             bodies: BTreeMap::new(),
             others: BTreeMap::new(),
             introduced: BTreeMap::new(),
-            missed: Vec::new(),
+            missed,
+            refused: BTreeSet::new(),
             known: KnownUsers::default(),
             access,
             tokens: BTreeMap::new(),
             users: Roster::default(),
             grabs: BTreeMap::new(),
+            refused_impulses: Vec::new(),
             scratch: Vec::new(),
             ledger: Ledger::default(),
-            next_opened: OPENED,
         };
         if let Some(invite) = peer.config.join.clone() {
-            peer.connect_to(&invite)?;
+            peer.carrier.call(&invite)?;
         }
-        Ok(peer)
-    }
-
-    /// Opens a connection to another peer.
-    fn connect_to(&mut self, invite: &Invite) -> Result<PeerId, TransportError> {
-        let options = JoinOptions {
-            identity: Some(Identity::from_pkcs8(&self.key)?),
-            limits: Limits { message: Limits::guest().message, ..self.limits.clone() },
-            emulation: self.emulation.clone(),
-            bind: None,
-        };
-        let endpoint = Endpoint::join(invite, options)?;
-        let peer = PeerId(self.next_opened);
-        self.next_opened += 1;
-        self.opened.insert(peer, endpoint);
         Ok(peer)
     }
 
@@ -197,7 +193,7 @@ impl NetPeer {
 
     /// Returns the invite with which others join through this peer.
     pub fn invite(&self) -> Invite {
-        self.listening.invite()
+        self.carrier.invite()
     }
 
     /// Returns the session, with more details. `None` until the models are loaded.
@@ -207,7 +203,7 @@ impl NetPeer {
 
     /// Returns the number of lost peers that this peer tries to reach ([`PeerConfig::rejoin`]).
     pub fn looked_for(&self) -> usize {
-        self.missed.len()
+        self.missed.count()
     }
 
     /// Returns the session's number of an entity's body.
@@ -215,37 +211,41 @@ impl NetPeer {
         self.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id)
     }
 
+    /// Whether there are links that [`set_emulation`](Self::set_emulation) changes: not over a
+    /// carrier of the app's own.
+    pub fn may_emulate(&self) -> bool {
+        self.quic().is_some()
+    }
+
     /// Returns the emulated link under every connection of this peer, if there is one.
-    pub fn emulation(&self) -> Option<&Emulation> {
-        self.emulation.as_ref()
+    pub fn emulation(&self) -> Option<Emulation> {
+        self.quic().and_then(QuicMesh::emulation)
     }
 
     /// Sets, replaces or removes the emulated link under every connection of this peer, at any
-    /// time.
-    pub fn set_emulation(&mut self, emulation: Option<Emulation>) {
-        self.listening.set_emulation(emulation.clone());
-        self.opened.values().for_each(|endpoint| endpoint.set_emulation(emulation.clone()));
-        self.emulation = emulation;
+    /// time. Changes nothing over a carrier of the app's own.
+    pub fn set_emulation(&self, emulation: Option<Emulation>) {
+        if let Some(quic) = self.quic() {
+            quic.set_emulation(emulation);
+        }
+    }
+
+    fn quic(&self) -> Option<&QuicMesh> {
+        (&*self.carrier as &dyn Any).downcast_ref()
     }
 
     fn now(&self) -> Duration {
         self.began.elapsed()
     }
 
-    /// Returns the endpoint of a connection, and the connection's number in that endpoint.
-    fn way(&self, peer: PeerId) -> (&Endpoint, PeerId) {
-        match self.opened.get(&peer) {
-            Some(endpoint) => (endpoint, PeerId::HOST),
-            None => (&self.listening, peer),
-        }
+    /// Ends all connections, without waiting for their goodbyes.
+    pub(crate) fn end_connections(&self) {
+        self.carrier.end();
     }
 
     pub(crate) fn metrics(&mut self) -> NetStats {
         let mut stats = NetStats::default();
-        let line = |&peer: &PeerId| {
-            let (endpoint, number) = self.way(peer);
-            Some((peer, endpoint.stats(number)?))
-        };
+        let line = |&peer: &PeerId| Some((peer, self.carrier.stats(peer)?));
         let lines: Vec<(PeerId, PeerStats)> = self.others.keys().filter_map(line).collect();
         for (peer, transport) in &lines {
             let link = self.session.as_ref().and_then(|session| session.stats(*peer)).unwrap_or_default();
@@ -275,7 +275,7 @@ impl NetPeer {
         let config = PeerSessionConfig {
             user,
             name: shortened(&self.config.name).to_owned(),
-            address: self.listening.invite().to_string(),
+            address: self.carrier.invite().to_string(),
             step: self.step.as_secs_f64(),
             repair: self.config.repair,
             idle_timeout: self.limits.idle_timeout,
@@ -285,6 +285,7 @@ impl NetPeer {
         let made = PeerSession::new(config).and_then(|mut session| {
             for (&id, played) in &self.bodies {
                 session.add_body(id, played.model.clone(), &played.settings)?;
+                session.set_surroundings(id, played.around.clone())?;
             }
             Ok(session)
         });
@@ -297,14 +298,14 @@ impl NetPeer {
         }
         if founds {
             self.enter(world, user);
-            world.write_message(SessionJoined { user, reconnected: false });
+            tell(world, SessionEvent::Joined(SessionJoined { user, reconnected: false }));
         }
     }
 
     /// Takes this peer's number.
     fn enter(&mut self, world: &mut World, user: UserId) {
         self.began_at = self.now();
-        self.known.see(self.listening.fingerprint(), user, |_| true);
+        self.known.see(self.carrier.fingerprint(), user, |_| true);
         self.state = PeerState::In { user };
         let name = shortened(&self.config.name);
         info!("among the peers as {name}, user {}", user.0);
@@ -331,25 +332,16 @@ impl NetPeer {
         if found.is_empty() {
             return false;
         }
-        for played in found.values() {
-            world.entity_mut(played.entity).insert((Driven::Remote, crate::remote::RemoteHands::default()));
+        for played in found.values_mut() {
+            // Who knows obstacles fills them in.
+            let added = (Driven::Remote, crate::remote::RemoteHands::default(), FixedObstacles::default());
+            world.entity_mut(played.entity).insert(added);
+            if let Some(told) = world.get::<FixedObstacles>(played.entity) {
+                played.around = play::agreed_surroundings(told);
+            }
         }
         (self.step, self.bodies) = (step, found);
         true
-    }
-}
-
-impl Drop for NetPeer {
-    /// Says goodbye on all connections at the same time. This takes at most a second, whatever
-    /// their number.
-    fn drop(&mut self) {
-        self.listening.signal();
-        let opened = std::mem::take(&mut self.opened).into_values();
-        self.ending.extend(opened.filter_map(Endpoint::close_detached));
-        for thread in self.ending.drain(..) {
-            // A panic of that thread has been reported there.
-            let _ = thread.join();
-        }
     }
 }
 

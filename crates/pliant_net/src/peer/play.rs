@@ -4,13 +4,13 @@ use std::sync::Arc;
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf};
-use pliant_modal::{Body, ModalModel};
+use pliant_body::{BodyState, FixedObstacles, Grab, GrabForce, GrabOf, Impulse};
+use pliant_modal::{Body, FixedObstacle, FixedShape, ModalModel};
 use pliant_stream::peer::PeerSession;
-use pliant_stream::{BodyId, GrabKey, StepSettings};
+use pliant_stream::{BodyId, GrabKey, StepSettings, StreamError, Surroundings};
 
 use super::{NetPeer, PeerState};
-use crate::own_grab::{HandSession, OwnGrab, send_grabs};
+use crate::own_grab::{self, HandSession, OwnGrab, send_grabs};
 use crate::session_transform::SessionTransform;
 use crate::view::{BodyDisplay, DisplayedBodies, remote_hands};
 
@@ -19,12 +19,14 @@ pub(super) struct PlayedBody {
     pub(super) entity: Entity,
     pub(super) model: Arc<ModalModel>,
     pub(super) settings: StepSettings,
+    pub(super) around: Surroundings,
     display: BodyDisplay,
 }
 
 impl PlayedBody {
     pub(super) fn new(entity: Entity, model: Arc<ModalModel>, settings: StepSettings) -> Self {
-        Self { entity, model, settings, display: BodyDisplay::default() }
+        let (around, display) = (Surroundings::default(), BodyDisplay::default());
+        Self { entity, model, settings, around, display }
     }
 }
 
@@ -45,23 +47,74 @@ pub(super) fn agreed_settings(body: &Body) -> StepSettings {
     StepSettings { gravity, ..settings }
 }
 
-/// `PostUpdate`: passes the app's own grabs to the session.
+/// Returns the surroundings with which all peers step this body: what stands still around it, in an
+/// order and with numbers that are the same on all machines.
+///
+/// More than [`Surroundings::MAX_OBSTACLES`] obstacles count as none.
+pub(super) fn agreed_surroundings(told: &FixedObstacles) -> Surroundings {
+    /// Resolution of lengths, m, and of quaternions: a power of two, so that rounding is exact.
+    const FINE: f64 = 1.0 / 1_048_576.0;
+    let round = |x: f64| (x / FINE).round() * FINE + 0.0;
+    let agreed = |of: &FixedObstacle| {
+        // Two quaternions are the same rotation. The last number other than zero is positive.
+        let rotation = of.rotation.map(round);
+        let last = rotation.iter().rev().find(|x| **x != 0.0);
+        let sign = last.map_or(1.0, |x| x.signum());
+        let shape = match of.shape {
+            FixedShape::Plane => FixedShape::Plane,
+            FixedShape::Ball { radius } => FixedShape::Ball { radius: round(radius) },
+            FixedShape::Box { half, round: by } => {
+                FixedShape::Box { half: half.map(round), round: round(by) }
+            }
+            FixedShape::Capsule { radius, half_length } => {
+                FixedShape::Capsule { radius: round(radius), half_length: round(half_length) }
+            }
+        };
+        let (position, rotation) = (of.position.map(round), rotation.map(|x| sign * x + 0.0));
+        FixedObstacle { shape, position, rotation }
+    };
+    let mut obstacles: Vec<FixedObstacle> = told.obstacles.iter().map(agreed).collect();
+    if obstacles.len() > Surroundings::MAX_OBSTACLES {
+        warn!("a body of peers touches nothing: it has {} obstacles", obstacles.len());
+        obstacles.clear();
+    }
+    // By all numbers, since entities have another order on each machine.
+    let key = |of: &FixedObstacle| {
+        let (kind, lengths) = match of.shape {
+            FixedShape::Plane => (0, [0.0; 4]),
+            FixedShape::Ball { radius } => (1, [radius, 0.0, 0.0, 0.0]),
+            FixedShape::Box { half: [x, y, z], round } => (2, [x, y, z, round]),
+            FixedShape::Capsule { radius, half_length } => (3, [radius, half_length, 0.0, 0.0]),
+        };
+        (kind, lengths.map(f64::to_bits), of.position.map(f64::to_bits), of.rotation.map(f64::to_bits))
+    };
+    obstacles.sort_by_key(key);
+    Surroundings { friction: told.friction, obstacles }
+}
+
+/// `PostUpdate`: passes the app's own grabs, and its impulses on the peers' bodies, to the session.
 pub(crate) fn send_hands(
     net: Option<ResMut<NetPeer>>,
     bodies: Query<(&BodyState, &GlobalTransform)>,
     grabs: Query<(Entity, &Grab, &GrabOf)>,
+    mut impulses: MessageReader<Impulse>,
 ) {
     let Some(mut net) = net else { return };
     let net = &mut *net;
-    if !matches!(net.state, PeerState::In { .. }) {
-        return;
-    }
-    let Some(session) = &mut net.session else { return };
     let body_of = |entity: Entity| {
         let (state, transform) = bodies.get(entity).ok()?;
         let (&id, _) = net.bodies.iter().find(|(_, played)| played.entity == entity)?;
         Some((id, state, transform))
     };
+    own_grab::send_impulses(&mut impulses, &mut net.refused_impulses, body_of, |body, vertex, impulse| {
+        let needed = "a session";
+        let none = StreamError::State { what: "apply_impulse", state: "not in", needed };
+        net.session.as_mut().ok_or(none)?.apply_impulse(body, vertex, impulse)
+    });
+    if !matches!(net.state, PeerState::In { .. }) {
+        return;
+    }
+    let Some(session) = &mut net.session else { return };
     send_grabs(session, &mut net.grabs, &grabs, body_of);
 }
 

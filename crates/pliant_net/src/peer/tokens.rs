@@ -13,7 +13,7 @@ impl NetPeer {
     /// Returns the invite to this peer that the peer at a connection is told: where tokens are
     /// asked for, with that peer's own token.
     pub(super) fn invite_for(&mut self, peer: PeerId) -> Invite {
-        let invite = Invite { token: None, ..self.listening.invite() };
+        let invite = Invite { token: None, ..self.carrier.invite() };
         let (Access::Tokens(_), Some(other)) = (&self.access, self.others.get(&peer)) else { return invite };
         let key = other.key;
         if let Some(&token) = self.tokens.get(&key) {
@@ -45,9 +45,9 @@ impl NetPeer {
     }
 
     fn admit_tokens(&self) {
-        if let Access::Tokens(grants) = &self.access {
+        if let (Access::Tokens(grants), Some(quic)) = (&self.access, self.quic()) {
             let given = self.tokens.values().map(|&token| Grant::hold(token));
-            self.listening.set_access(Access::Tokens(grants.iter().cloned().chain(given).collect()));
+            quic.set_access(Access::Tokens(grants.iter().cloned().chain(given).collect()));
         }
     }
 }

@@ -16,7 +16,7 @@ use pliant_stream::{DisconnectReason, Role};
 
 /// The application protocol and its version. The handshake negotiates it and refuses another
 /// version.
-pub const ALPN: &[u8] = b"pliant/5";
+pub const ALPN: &[u8] = b"pliant/7";
 
 /// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -104,8 +104,9 @@ pub struct Limits {
     pub message: usize,
     /// Most bytes of messages that are not yet sent or not yet read, for each peer and direction. A
     /// single message is accepted whatever its length. Toward the peer, a full queue gives
-    /// [`SendError::QueueFull`](super::SendError::QueueFull). From the peer, flow control applies,
-    /// and no more than the longest message waits. Default: 64 MiB.
+    /// [`SendError::QueueFull`](super::SendError::QueueFull). From the peer, no more than the
+    /// longest message waits: over QUIC flow control holds the peer back, and on a
+    /// [`CarrierPort`](super::CarrierPort) the connection is closed. Default: 64 MiB.
     pub queued_messages: usize,
     /// Most datagrams that are not yet sent, or not yet read, for each peer and direction. A full
     /// queue drops its oldest datagram. Default: 64.
@@ -139,6 +140,18 @@ impl Limits {
     /// Returns the defaults of a guest.
     pub fn guest() -> Self {
         Self { peers: 1, message: 256 << 20, ..Self::host() }
+    }
+
+    /// Returns the limits of a connection that a peer opens to another one, which may send it a
+    /// state.
+    pub(super) fn of_a_call(&self) -> Self {
+        Self { message: Self::guest().message, ..self.clone() }
+    }
+
+    /// Returns how many bytes of a peer's messages may wait to be read. A message that is too long
+    /// is not queued, so more room than for the longest is of no use.
+    pub(super) fn unread_messages(&self) -> usize {
+        self.queued_messages.min(self.message)
     }
 }
 

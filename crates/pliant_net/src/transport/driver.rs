@@ -1,31 +1,33 @@
 //! The network thread's side of an endpoint.
 
 use std::future::{Future, poll_fn};
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::pin::pin;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex};
 use std::task::Poll;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, SystemTime};
 
+use bevy::platform::time::Instant;
 use bytes::Bytes;
 use pliant_stream::{DisconnectReason, PeerId, Role};
 use quinn::{
-    ClientConfig, Connection, ConnectionError, EndpointConfig, Incoming, RecvStream, Runtime,
-    SendDatagramError, SendStream, ServerConfig, TokioRuntime, TransportErrorCode, VarInt,
+    ClientConfig, Connection, ConnectionError, Incoming, RecvStream, SendDatagramError, SendStream,
+    ServerConfig, TransportErrorCode, VarInt,
 };
 use rustls::pki_types::CertificateDer;
 use tokio::sync::Notify;
+use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 use tracing::{debug, warn};
 
+use super::carrier::Event;
 use super::congestion::Bucket;
-use super::emulated::Emulated;
-use super::endpoint::{EndpointShared, Event, PeerConnection, TransportError};
+use super::connections::{GRACE, MESSAGE_PART, PeerConnection};
+use super::endpoint::EndpointShared;
 use super::identity::{Fingerprint, SERVER_NAME};
 use super::invite::Invite;
-use super::places::Place;
+use super::places::Reservation;
 use super::queue::{Next, lock};
 use super::stats::PeerStats;
 use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
@@ -35,9 +37,6 @@ fn code_of(reason: DisconnectReason) -> VarInt {
     VarInt::from_u32(reason.code().into())
 }
 
-/// Longest time to deliver the last messages before a close.
-const GRACE: Duration = Duration::from_secs(1);
-
 /// The role of this endpoint.
 #[derive(Debug)]
 pub(super) enum Side {
@@ -45,84 +44,40 @@ pub(super) enum Side {
     Guest { client: ClientConfig, invite: Invite, refused: Arc<Mutex<Option<Fingerprint>>> },
 }
 
-/// Runs until the application drops its side.
-pub(super) async fn run(
-    shared: Arc<EndpointShared>,
-    socket: UdpSocket,
-    side: Side,
-    ready: SyncSender<Result<quinn::Endpoint, TransportError>>,
-) {
-    let server = match &side {
-        Side::Host { server } => Some(server.clone()),
-        Side::Guest { .. } => None,
-    };
-    let endpoint = match open(&shared, socket, server) {
-        Ok(endpoint) => endpoint,
-        Err(error) => {
-            // If the receiver is gone, the application is gone as well.
-            let _ = ready.send(Err(error));
-            return;
-        }
-    };
-    let _ = ready.send(Ok(endpoint.clone()));
+/// Runs until the endpoint is over and its connections have ended.
+pub(super) async fn run(shared: &Arc<EndpointShared>, quic: &quinn::Endpoint, side: Side) {
     match side {
-        Side::Host { .. } => accept(&shared, &endpoint).await,
+        Side::Host { .. } => accept(shared, quic).await,
         Side::Guest { client, invite, refused } => loop {
-            let joined = join(&shared, &endpoint, client.clone(), &invite, &refused);
-            tokio::select! {
-                () = shared.stop.notified() => break,
-                () = joined => {}
-            }
+            join(shared, quic, client.clone(), &invite, &refused).await;
             // The application decides when the next attempt begins.
             tokio::select! {
-                () = shared.stop.notified() => break,
+                () = shared.stopped() => break,
                 () = shared.reconnect.notified() => {}
             }
         },
     }
-    endpoint.close(code_of(DisconnectReason::Left), &[]);
-    // QUIC repeats close packets while the other end still sends. This must not delay an
-    // application that ends.
-    let _ = timeout(Duration::from_secs(1), endpoint.wait_idle()).await;
-}
-
-fn open(
-    shared: &EndpointShared,
-    socket: UdpSocket,
-    server: Option<ServerConfig>,
-) -> Result<quinn::Endpoint, TransportError> {
-    let runtime = Arc::new(TokioRuntime);
-    let socket = Emulated::under(runtime.wrap_udp_socket(socket)?, &shared.emulator);
-    Ok(quinn::Endpoint::new_with_abstract_socket(EndpointConfig::default(), server, socket, runtime)?)
-}
-
-/// Continues on another socket, which the host sees as a migration of the guest. Must be called on
-/// the network runtime.
-pub(super) fn move_to(
-    shared: &EndpointShared,
-    endpoint: &quinn::Endpoint,
-    socket: UdpSocket,
-) -> std::io::Result<()> {
-    let socket = TokioRuntime.wrap_udp_socket(socket)?;
-    endpoint.rebind_abstract(Emulated::under(socket, &shared.emulator))
 }
 
 /// Number of open handshakes above which a new guest must first prove its address.
 const HANDSHAKES_BEFORE_RETRY: usize = 16;
 
-async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
+async fn accept(shared: &Arc<EndpointShared>, quic: &quinn::Endpoint) {
     let handshakes = Arc::new(AtomicUsize::new(0));
+    let mut guests = JoinSet::new();
+    let mut stopped = pin!(shared.stopped());
     loop {
         let incoming = tokio::select! {
-            () = shared.stop.notified() => break,
-            incoming = endpoint.accept() => match incoming {
+            () = &mut stopped => break,
+            Some(_) = guests.join_next() => continue,
+            incoming = quic.accept() => match incoming {
                 Some(incoming) => incoming,
                 None => break,
             },
         };
         let open = handshakes.load(Ordering::Relaxed);
         let address = incoming.remote_address();
-        if shared.inbox.overloaded() {
+        if shared.connections.inbox.overloaded() {
             debug!(%address, "refused a guest: the application does not read");
             incoming.refuse();
         } else if open >= HANDSHAKES_BEFORE_RETRY
@@ -133,18 +88,20 @@ async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
                 debug!(%address, %error, "could not ask a guest to prove its address");
             }
         } else {
-            let Some(place) = Place::take(&shared.places, &shared.limits, address.ip()) else {
+            let Some(place) = Reservation::take(&shared.places, &shared.connections.limits, address.ip())
+            else {
                 debug!(%address, "refused a guest: no room, or too many from its address");
                 incoming.refuse();
                 continue;
             };
             handshakes.fetch_add(1, Ordering::Relaxed);
             let (shared, handshakes) = (Arc::clone(shared), Arc::clone(&handshakes));
-            tokio::spawn(async move {
+            guests.spawn(async move {
                 let leaving = place.leaving();
                 let welcomed = tokio::select! {
-                    welcomed = timeout(shared.limits.handshake, welcome(&shared, incoming, place)) => welcomed,
+                    welcomed = timeout(shared.connections.limits.handshake, welcome(&shared, incoming, place)) => welcomed,
                     () = leaving.notified() => Ok(Err(DisconnectReason::Silent)),
+                    () = shared.stopped() => Ok(Err(DisconnectReason::Left)),
                 };
                 handshakes.fetch_sub(1, Ordering::Relaxed);
                 match welcomed {
@@ -155,11 +112,12 @@ async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
             });
         }
     }
-    endpoint.close(code_of(DisconnectReason::Left), &[]);
+    // Each guest gets its last messages and a goodbye, for which [`hang_up`] has a limit.
+    while guests.join_next().await.is_some() {}
 }
 
 /// An open connection after a complete handshake.
-struct Open {
+struct OpenConnection {
     peer: PeerId,
     role: Role,
     fingerprint: Fingerprint,
@@ -167,32 +125,35 @@ struct Open {
     send: SendStream,
     recv: RecvStream,
     /// The place at this host. `None` on a guest.
-    place: Option<Place>,
+    place: Option<Reservation>,
 }
 
 /// The host's half of the handshake.
 async fn welcome(
     shared: &EndpointShared,
     incoming: Incoming,
-    place: Place,
-) -> Result<Open, DisconnectReason> {
+    place: Reservation,
+) -> Result<OpenConnection, DisconnectReason> {
     let connection = incoming.accept().map_err(reason_of)?.await.map_err(reason_of)?;
-    let refuse = |reason| {
-        connection.close(code_of(reason), &[]);
-        reason
+    let Some(fingerprint) = fingerprint_of(&connection) else {
+        connection.close(code_of(DisconnectReason::Protocol), &[]);
+        return Err(DisconnectReason::Protocol);
     };
-    let fingerprint = fingerprint_of(&connection).ok_or_else(|| refuse(DisconnectReason::Protocol))?;
     let (mut send, mut recv) = connection.accept_bi().await.map_err(reason_of)?;
     let first = wire::read_message(&mut recv, TOKEN_MESSAGE).await;
     let token = first.ok().and_then(|first| wire::token_from_message(&first).ok());
-    let Some(token) = token else {
-        return Err(refuse(DisconnectReason::Protocol));
-    };
     let access = Arc::clone(&lock(&shared.access));
-    let role = access.role(token, SystemTime::now()).map_err(refuse)?;
-    if shared.is_stopping() {
-        return Err(refuse(DisconnectReason::Left));
-    }
+    let role = match token {
+        Some(token) => access.role(token, SystemTime::now()),
+        None => Err(DisconnectReason::Protocol),
+    };
+    let role = match role {
+        Ok(role) => role,
+        Err(reason) => {
+            say_goodbye(&connection, &mut send, reason).await;
+            return Err(reason);
+        }
+    };
     discard_early(&connection).await;
     let answered = async {
         wire::write_prefix(&mut send, 1).await?;
@@ -202,7 +163,7 @@ async fn welcome(
         return Err(DisconnectReason::Lost);
     }
     let peer = PeerId(shared.next_peer.fetch_add(1, Ordering::Relaxed));
-    Ok(Open { peer, role, fingerprint, connection, send, recv, place: Some(place) })
+    Ok(OpenConnection { peer, role, fingerprint, connection, send, recv, place: Some(place) })
 }
 
 /// The guest's half of the handshake: one attempt, whose result is reported as an event.
@@ -213,10 +174,13 @@ async fn join(
     invite: &Invite,
     refused: &Mutex<Option<Fingerprint>>,
 ) {
-    let entered = timeout(shared.limits.handshake, enter(endpoint, client, invite, refused)).await;
+    let entered = tokio::select! {
+        entered = timeout(shared.connections.limits.handshake, enter(endpoint, client, invite, refused)) => entered,
+        () = shared.stopped() => Ok(Err(DisconnectReason::Left)),
+    };
     match entered.unwrap_or(Err(DisconnectReason::Silent)) {
         Ok(host) => host.serve(shared).await,
-        Err(reason) => shared.inbox.close(PeerId::HOST, reason),
+        Err(reason) => shared.connections.ended(PeerId::HOST, reason),
     }
 }
 
@@ -225,7 +189,7 @@ async fn enter(
     client: ClientConfig,
     invite: &Invite,
     refused: &Mutex<Option<Fingerprint>>,
-) -> Result<Open, DisconnectReason> {
+) -> Result<OpenConnection, DisconnectReason> {
     let resolved = tokio::net::lookup_host((invite.host.as_str(), invite.port)).await;
     let address = match resolved.map(|mut addresses| addresses.next()) {
         Ok(Some(address)) => address,
@@ -260,19 +224,23 @@ async fn enter(
         send.write_all(&token).await
     };
     let welcomed = match written.await {
-        Ok(()) => wire::read_message(&mut recv, 1).await.ok(),
-        Err(_) => None,
+        Ok(()) => wire::read_message(&mut recv, 1).await,
+        Err(error) => {
+            debug!("the host did not take the token: {error}");
+            // The end of the connection carries the reason.
+            return Err(reason(connection.closed().await));
+        }
     };
     let role = match welcomed.map(|message| message.first().copied().and_then(Role::from_byte)) {
-        Some(Some(role)) => role,
-        Some(None) => return Err(DisconnectReason::Protocol),
-        // A refusal closes the connection, and the reason is in the close.
-        None => {
+        Ok(Some(role)) => role,
+        Err(ReadMessageError::Goodbye(reason)) => return Err(reason),
+        Ok(None) | Err(ReadMessageError::TooLong { .. }) => return Err(DisconnectReason::Protocol),
+        Err(ReadMessageError::Ended(_)) => {
             let closed = timeout(Duration::from_millis(200), connection.closed()).await;
             return Err(closed.map_or(DisconnectReason::Lost, reason));
         }
     };
-    Ok(Open {
+    Ok(OpenConnection {
         peer: PeerId::HOST,
         role,
         fingerprint: invite.fingerprint,
@@ -307,8 +275,7 @@ fn reason_of(error: ConnectionError) -> DisconnectReason {
         ConnectionError::TimedOut => DisconnectReason::Silent,
         ConnectionError::ApplicationClosed(close) => {
             let code = u8::try_from(close.error_code.into_inner());
-            // A later version may have more reasons.
-            code.ok().and_then(DisconnectReason::from_code).unwrap_or(DisconnectReason::Left)
+            code.map_or(DisconnectReason::Left, wire::reason_with_code)
         }
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::CONNECTION_REFUSED =>
@@ -327,24 +294,24 @@ fn reason_of(error: ConnectionError) -> DisconnectReason {
     }
 }
 
-impl Open {
+impl OpenConnection {
     /// Carries the connection's traffic until it ends, and reports its beginning and end to the
     /// application.
     async fn serve(self, shared: &EndpointShared) {
         let Self { peer: id, role, fingerprint, connection, mut send, mut recv, place } = self;
         let peer = Arc::new(PeerConnection::default());
         refresh(&connection, &peer);
-        lock(&shared.peers).insert(id, Arc::clone(&peer));
-        let address = connection.remote_address();
-        let room = shared.inbox.open(id, Event::Connected { peer: id, fingerprint, address, role });
-        let bucket = Mutex::new(Bucket::new(shared.limits.rate, Instant::now()));
+        let address = Some(connection.remote_address());
+        let connected = Event::Connected { peer: id, fingerprint, address, role };
+        let room = shared.connections.open(id, Arc::clone(&peer), connected);
+        let bucket = Mutex::new(Bucket::new(shared.connections.limits.rate, Instant::now()));
         let reason = {
             let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room, place.as_ref()));
             let datagrams_in = pin!(read_datagrams(shared, id, &connection, &peer));
             let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
             let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
             let metrics = pin!(keep_metrics(&connection, &peer));
-            let hung_up = pin!(hang_up(&connection, &peer));
+            let hung_up = pin!(hang_up(shared, &connection, &peer));
             let makes_room = pin!(make_room(&connection, place.as_ref()));
             tokio::select! {
                 reason = messages_in => reason,
@@ -358,8 +325,7 @@ impl Open {
             }
         };
         debug!(peer = id.0, %reason, "connection closed");
-        lock(&shared.peers).remove(&id);
-        shared.inbox.close(id, reason);
+        shared.connections.ended(id, reason);
     }
 }
 
@@ -413,22 +379,25 @@ async fn read_messages(
     connection: &Connection,
     recv: &mut RecvStream,
     room: &Notify,
-    place: Option<&Place>,
+    place: Option<&Reservation>,
 ) -> DisconnectReason {
-    // A message that is too long is not queued, so more room than for the longest is of no use.
-    let most = shared.limits.queued_messages.min(shared.limits.message);
+    let most = shared.connections.limits.unread_messages();
     loop {
-        match wire::read_message(recv, shared.limits.message).await {
+        match wire::read_message(recv, shared.connections.limits.message).await {
             Ok(message) => {
                 if let Some(place) = place {
                     place.keep();
                 }
-                shared.inbox.put_message(id, message, most, room).await;
+                shared.connections.inbox.put_message(id, message, most, room).await;
             }
             Err(error @ ReadMessageError::TooLong { .. }) => {
                 debug!(peer = id.0, %error, "the connection is closed");
                 connection.close(code_of(DisconnectReason::Protocol), &[]);
                 return DisconnectReason::Protocol;
+            }
+            Err(ReadMessageError::Goodbye(reason)) => {
+                connection.close(code_of(reason), &[]);
+                return reason;
             }
             // The other end has finished its stream, or the connection is gone. The end of the
             // connection carries the reason.
@@ -439,17 +408,18 @@ async fn read_messages(
 
 async fn read_datagrams(shared: &EndpointShared, id: PeerId, connection: &Connection, peer: &PeerConnection) {
     while let Ok(bytes) = connection.read_datagram().await {
-        let dropped = shared.inbox.push_datagram(id, Instant::now(), bytes, shared.limits.queued_datagrams);
+        let dropped = shared.connections.inbox.push_datagram(
+            id,
+            Instant::now(),
+            bytes,
+            shared.connections.limits.queued_datagrams,
+        );
         if dropped > 0 {
             lock(&peer.dropped).receive_queue_full += dropped;
         }
     }
     std::future::pending().await
 }
-
-/// Messages are written in parts of this size, bytes, so that the rate cap applies within a long
-/// message.
-const MESSAGE_PART: usize = 2048;
 
 async fn write_messages(
     connection: &Connection,
@@ -465,27 +435,41 @@ async fn write_messages(
                 }
             }
             Next::Close(reason) => {
-                // A stream or connection that is already closed needs no goodbye.
-                let _ = send.finish();
-                let _ = timeout(GRACE, send.stopped()).await;
-                connection.close(code_of(reason), &[]);
+                say_goodbye(connection, send, reason).await;
                 return reason;
             }
         }
     }
 }
 
-/// Closes the connection after [`GRACE`], even if a peer that does not read delays the messages
-/// before the goodbye.
-async fn hang_up(connection: &Connection, peer: &PeerConnection) -> DisconnectReason {
-    let reason = peer.outbox.closing().await;
+/// Tells the reason of the end, and then closes the connection.
+async fn say_goodbye(connection: &Connection, send: &mut SendStream, reason: DisconnectReason) {
+    // The close gives the reason to an end that has not read the stream so far.
+    let _ = timeout(GRACE, wire::write_goodbye(send, reason)).await;
+    connection.close(code_of(reason), &[]);
+}
+
+/// Closes the connection when the endpoint is over. Does so after [`GRACE`] whenever it is to be
+/// closed, even if a peer that does not read delays the messages before the goodbye.
+async fn hang_up(
+    shared: &EndpointShared,
+    connection: &Connection,
+    peer: &PeerConnection,
+) -> DisconnectReason {
+    let reason = tokio::select! {
+        reason = peer.outbox.closing() => reason,
+        () = shared.stopped() => {
+            peer.outbox.close(DisconnectReason::Left);
+            peer.outbox.closing().await
+        }
+    };
     sleep(GRACE).await;
     connection.close(code_of(reason), &[]);
     reason
 }
 
 /// Closes a silent connection that must make room for a newcomer.
-async fn make_room(connection: &Connection, place: Option<&Place>) -> DisconnectReason {
+async fn make_room(connection: &Connection, place: Option<&Reservation>) -> DisconnectReason {
     match place {
         Some(place) => place.leaving().notified().await,
         None => std::future::pending().await,

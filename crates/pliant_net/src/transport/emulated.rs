@@ -8,8 +8,8 @@ use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
-use std::time::Instant;
 
+use bevy::platform::time::Instant;
 use bytes::Bytes;
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Preset};
 use quinn::udp::{RecvMeta, Transmit};

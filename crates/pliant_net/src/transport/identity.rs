@@ -27,8 +27,18 @@ use thiserror::Error;
 pub struct Fingerprint(pub [u8; 32]);
 
 impl Fingerprint {
+    /// Returns the SHA-256 hash of a name, for carriers that know users by names or numbers instead
+    /// of keys. It proves nothing: the carrier answers for who has the name.
+    pub fn of_name(name: &[u8]) -> Self {
+        Self::sha256(name)
+    }
+
     pub(super) fn of_public_key(spki: &[u8]) -> Self {
-        let digest = ring::digest::digest(&ring::digest::SHA256, spki);
+        Self::sha256(spki)
+    }
+
+    fn sha256(of: &[u8]) -> Self {
+        let digest = ring::digest::digest(&ring::digest::SHA256, of);
         let mut bytes = [0; 32];
         for (to, from) in bytes.iter_mut().zip(digest.as_ref()) {
             *to = *from;

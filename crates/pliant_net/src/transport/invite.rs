@@ -122,6 +122,14 @@ impl FromStr for Invite {
     }
 }
 
+impl TryFrom<&str> for Invite {
+    type Error = InviteError;
+
+    fn try_from(text: &str) -> Result<Self, Self::Error> {
+        text.parse()
+    }
+}
+
 const SCHEME: &str = "pliant://";
 
 /// Describes a text that is no invite, without any of it. A mistyped invite still has its token,

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
 
+use bevy::platform::time::Instant;
 use tokio::sync::Notify;
 
 use super::config::Limits;
@@ -128,13 +128,13 @@ impl Arrivals {
 
 /// A place, which is free again when this value is dropped.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct Reservation {
     places: Arc<Mutex<Places>>,
     id: u64,
     leave: Arc<Notify>,
 }
 
-impl Place {
+impl Reservation {
     /// Takes a place for an arrival from an address. `None`: there is none.
     pub(super) fn take(places: &Arc<Mutex<Places>>, limits: &Limits, address: IpAddr) -> Option<Self> {
         let (id, leave) = lock(places).take(limits, Instant::now(), address)?;
@@ -154,7 +154,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for Reservation {
     fn drop(&mut self) {
         lock(&self.places).free(self.id);
     }

@@ -5,12 +5,12 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::PoisonError;
-use std::time::Instant;
 
+use bevy::platform::time::Instant;
 use bytes::Bytes;
 use pliant_stream::{DisconnectReason, PeerId};
 
-use super::endpoint::Event;
+use super::carrier::Event;
 use super::sync::{Arc, Mutex, MutexGuard, Notify};
 
 /// Locks a mutex, even if another thread has panicked while it held the lock. The queues hold plain
@@ -142,6 +142,11 @@ impl Inbox {
             queue.datagrams.clear();
             queue.events.push_back(Event::Closed { peer, reason });
         });
+    }
+
+    /// Drops what waits of a peer, and what it will still send.
+    pub(super) fn forget(&self, peer: PeerId) {
+        lock(&self.0).peers.remove(&peer);
     }
 
     pub(super) fn overloaded(&self) -> bool {
@@ -297,11 +302,34 @@ impl Outbox {
         lock(&self.state).datagrams.pop_front()
     }
 
+    /// Returns the length of the oldest datagram, if one waits.
+    pub(super) fn datagram_len(&self) -> Option<usize> {
+        lock(&self.state).datagrams.front().map(Bytes::len)
+    }
+
+    /// Returns the length of the next message, or 0 for a goodbye, if one of them waits.
+    pub(super) fn next_len(&self) -> Option<usize> {
+        let state = lock(&self.state);
+        state.messages.front().map(Bytes::len).or(state.closing.map(|_| 0))
+    }
+
+    /// Drops the messages that wait, so that a goodbye is next.
+    pub(super) fn drop_messages(&self) {
+        let mut state = lock(&self.state);
+        state.messages.clear();
+        state.message_bytes = 0;
+    }
+
+    /// Returns whether [`Outbox::close`] was called.
+    pub(super) fn is_closing(&self) -> bool {
+        lock(&self.state).hung_up.is_some()
+    }
+
     /// Waits for a datagram and returns the length of the oldest.
     pub(super) async fn first_datagram_len(&self) -> usize {
         loop {
-            if let Some(first) = lock(&self.state).datagrams.front() {
-                return first.len();
+            if let Some(len) = self.datagram_len() {
+                return len;
             }
             self.datagram_waits.notified().await;
         }

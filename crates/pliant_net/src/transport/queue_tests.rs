@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 
-use super::endpoint::Event;
+use super::carrier::Event;
 use super::queue::*;
 use super::{DisconnectReason, PeerId};
 

@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use pliant_net::transport::{
-    Emulation, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, RateCap,
-    SendError,
+    Carrier, Emulation, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, RateCap,
+    SendError, TransportError,
 };
 use pliant_stream::DisconnectReason;
-use pliant_stream::emulator::{LinkConfig, Preset};
+use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 
 use crate::endpoints::{closed, connected, datagram, guest, host, message, patient};
 use crate::wait::{must, wait_for};
@@ -243,4 +243,60 @@ fn a_guest_joins_again_after_its_host_has_come_back() {
     guest.rejoin();
     second.send_message(PeerId(1), Bytes::from_static(b"hello again")).unwrap();
     assert_eq!(message(&guest), "hello again");
+}
+
+#[test]
+fn the_next_host_at_an_address_begins_while_the_last_one_says_goodbye() {
+    let first = host();
+    let bind = first.local_address();
+    let next_host = || Endpoint::host(HostOptions { bind, ..HostOptions::default() });
+    assert!(matches!(next_host(), Err(TransportError::Bind { address, .. }) if address == bind));
+    let old = guest(&first.invite());
+    connected(&old);
+    let (at_first, _) = connected(&first);
+    // The link takes a second to the guest, so that the goodbye is under way when the next begins.
+    let link = LinkConfig { delay: Duration::from_secs(1), ..LinkConfig::default() };
+    first.set_emulation(Some(Emulation { outgoing: link, incoming: LinkConfig::default(), seed: 1 }));
+    first.send_message(at_first, Bytes::from_static(b"the last words")).unwrap();
+    let dropping = std::thread::spawn(move || drop(first));
+    let second = wait_for("the address is free", || next_host().ok());
+    assert!(!dropping.is_finished(), "the first one still waits for its guest");
+    let new = guest(&second.invite());
+    connected(&new);
+    connected(&second);
+    assert_eq!(message(&old), "the last words");
+    assert_eq!(closed(&old), DisconnectReason::Left);
+    dropping.join().unwrap();
+    second.send_message(PeerId(1), Bytes::from_static(b"still here")).unwrap();
+    assert_eq!(message(&new), "still here");
+    drop((new, second));
+    std::net::UdpSocket::bind(bind).unwrap();
+}
+
+#[test]
+fn the_reason_of_the_end_arrives_over_a_link_that_loses_the_last_packet() {
+    let limits = Limits { keep_alive: Duration::from_secs(10), ..Limits::host() };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    // The guests have nothing to send, so that nothing makes the host repeat a packet that only
+    // says that the connection is closed.
+    let limits = || Limits {
+        idle_timeout: Duration::from_secs(3),
+        keep_alive: Duration::from_secs(10),
+        ..Limits::guest()
+    };
+    let join = || Endpoint::join(&host.invite(), JoinOptions { limits: limits(), ..JoinOptions::default() });
+    let guests: Vec<Endpoint> = (0..48).map(|_| join().unwrap()).collect();
+    let peers: Vec<PeerId> = guests.iter().map(|_| connected(&host).0).collect();
+    let delay = Duration::from_millis(10);
+    let lossy = LinkConfig { loss: Loss::Random(0.09), delay, ..LinkConfig::default() };
+    host.set_emulation(Some(Emulation { outgoing: lossy.clone(), incoming: lossy, seed: 1 }));
+    for &peer in &peers[..24] {
+        host.close(peer, DisconnectReason::Kicked);
+    }
+    (0..24).for_each(|_| assert_eq!(closed(&host), DisconnectReason::Kicked));
+    drop(host);
+    let mut heard: Vec<DisconnectReason> = guests.iter().map(closed).collect();
+    heard.sort_by_key(|reason| reason.code());
+    let (left, kicked) = ([DisconnectReason::Left; 24], [DisconnectReason::Kicked; 24]);
+    assert_eq!(heard, [left, kicked].concat());
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use pliant_net::transport::{
-    DisconnectReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
+    Carrier, DisconnectReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
 };
 
 use crate::wait::wait_for;

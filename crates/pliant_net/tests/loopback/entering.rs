@@ -5,8 +5,8 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use pliant_net::transport::{
-    ALPN, Access, Endpoint, Event, Fingerprint, Grant, HostOptions, Invite, JoinOptions, Limits, PeerId,
-    Role, Token,
+    ALPN, Access, Carrier, Endpoint, Event, Fingerprint, Grant, HostOptions, Invite, JoinOptions, Limits,
+    PeerId, Role, Token,
 };
 use pliant_stream::DisconnectReason;
 

@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use pliant_net::transport::{
-    ALPN, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, RateCap, SendError,
+    ALPN, Carrier, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, RateCap,
+    SendError,
 };
 use pliant_stream::DisconnectReason;
 

@@ -3,7 +3,8 @@
 use bevy::{ecs::system::SystemParam, prelude::*};
 use bevy_egui::egui::Ui;
 use pliant_net::{
-    Emulation, GuestState, Hands, NetGuest, NetHost, NetPeer, NetStats, PeerState, User, UserLink, Yourself,
+    Emulation, GuestState, Hands, NetGuest, NetHost, NetPeer, NetStats, PeerState, SessionCommands, User,
+    UserLink, Yourself,
 };
 
 use super::{emulator, hands::srgb};
@@ -23,8 +24,9 @@ pub(super) struct SessionHistories {
 
 #[derive(SystemParam)]
 pub(super) struct Session<'w, 's> {
-    host: Option<ResMut<'w, NetHost>>,
-    guest: Option<ResMut<'w, NetGuest>>,
+    commands: Commands<'w, 's>,
+    host: Option<Res<'w, NetHost>>,
+    guest: Option<Res<'w, NetGuest>>,
     peer: Option<ResMut<'w, NetPeer>>,
     stats: Option<Res<'w, NetStats>>,
     histories: ResMut<'w, SessionHistories>,
@@ -104,17 +106,12 @@ impl Session<'_, '_> {
             self.emulate(emulator::emulation_of(&before, &wanted, now.as_ref()));
         }
         if view.leave {
-            if let Some(host) = &mut self.host {
-                host.end();
-            } else if let Some(guest) = &mut self.guest {
-                guest.leave();
-            }
+            self.commands.leave_session();
         }
     }
 
     fn role(&self) -> String {
         match (&self.host, &self.guest, &self.peer) {
-            (Some(host), ..) if host.has_ended() => "the session is over".into(),
             (Some(_), ..) => "host".into(),
             (None, Some(guest), _) => match guest.state() {
                 GuestState::Joining => "guest, joining".into(),
@@ -133,32 +130,41 @@ impl Session<'_, '_> {
 
     fn invite(&self) -> Option<String> {
         match (&self.host, &self.peer) {
-            (Some(host), _) => (!host.has_ended()).then(|| host.invite().to_string()),
+            (Some(host), _) => host.invite().map(|invite| invite.to_string()),
             (None, Some(peer)) => Some(peer.invite().to_string()),
             (None, None) => None,
         }
     }
 
     fn way_out(&self) -> Option<&'static str> {
-        match (&self.host, &self.guest) {
-            (Some(host), _) => (!host.has_ended()).then_some("End the session"),
-            (None, Some(guest)) => (!matches!(guest.state(), GuestState::Closed { .. })).then_some("Leave"),
-            (None, None) => None,
+        match (&self.host, &self.guest, &self.peer) {
+            (Some(_), ..) => Some("End the session"),
+            (None, Some(guest), _) => {
+                (!matches!(guest.state(), GuestState::Closed { .. })).then_some("Leave")
+            }
+            (None, None, Some(peer)) => {
+                (!matches!(peer.state(), PeerState::Closed { .. })).then_some("Leave")
+            }
+            (None, None, None) => None,
         }
     }
 
-    /// Whether the session has a network to emulate. The playback of a recording has none.
+    /// Whether the session has a network to emulate. The playback of a recording has none, and one
+    /// over a carrier of the app's own neither.
     fn may_emulate(&self) -> bool {
-        self.host.is_some()
-            || self.peer.is_some()
-            || self.guest.as_ref().is_some_and(|guest| guest.endpoint().is_some())
+        match (&self.host, &self.guest, &self.peer) {
+            (Some(host), ..) => host.may_emulate(),
+            (None, Some(guest), _) => guest.may_emulate(),
+            (None, None, Some(peer)) => peer.may_emulate(),
+            (None, None, None) => false,
+        }
     }
 
     fn emulation(&self) -> Option<Emulation> {
         match (&self.host, &self.guest, &self.peer) {
             (Some(host), ..) => host.emulation(),
             (None, Some(guest), _) => guest.emulation(),
-            (None, None, Some(peer)) => peer.emulation().cloned(),
+            (None, None, Some(peer)) => peer.emulation(),
             (None, None, None) => None,
         }
     }
