@@ -66,8 +66,9 @@ pub use control_loop::local_model::{
     HeldGrab, LocalModel, MAX_CONTACTS, MAX_PLANES, ModelWriter, PublishedGrab, ToolContact, TouchBall,
     TouchPlane,
 };
-pub use control_loop::runner::{HapticLoop, StopSwitch};
+pub use control_loop::runner::HapticLoop;
 pub use control_loop::scheduler::{LoopClock, RealScheduler, VirtualScheduler};
+pub use control_loop::stop::StopSwitch;
 pub use control_loop::tool::ToolMap;
 pub use device::find::{FindConfig, Found, OpenError, find_devices};
 pub use device::hand::HandModel;

@@ -94,7 +94,7 @@ fn simulation_late_by_a_second() {
     scene.run(0.020);
     assert!(scene.force() > 0.9 * before);
     scene.run(0.031);
-    assert_eq!(scene.force(), 0.0, "50 ms after the last word");
+    assert_eq!(scene.force(), 0.0, "50 ms after the last command");
     assert!(has(&scene, |f| matches!(f, Fault::Stale(_))));
     scene.run(0.95);
     scene.silent = false;

@@ -204,6 +204,30 @@ fn the_emergency_stop_works_while_a_call_hangs() {
 }
 
 #[test]
+fn a_stop_that_cannot_be_reset_while_a_call_hangs_stays_pressed() {
+    let path = fake("dhd", "hang_reset", &["-DWITHOUT_WATCHDOG"]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let mut game = Game::start(ForceDimension::open(dhd(&path)).unwrap());
+    game.pull(&library);
+    hang_dhd(&library, true);
+    game.running.emergency_stop();
+    seconds_to_zero(|| motor(&library));
+    // The app goes on, and its commands wait until the queue is full.
+    while game.running.set_tool(Default::default()) {}
+    assert!(!game.running.reset_stop(), "the queue is full");
+    assert!(game.running.stop_switch().is_pressed(), "the stop stays pressed");
+    hang_dhd(&library, false);
+    for _ in 0..50 {
+        game.publish();
+        std::thread::sleep(Duration::from_millis(2));
+        assert_eq!(motor(&library), 0.0, "it is latched, also when the call has returned");
+    }
+    assert!(game.running.reset_stop());
+    game.pull(&library);
+}
+
+#[test]
 fn the_emergency_stop_ends_a_drive_to_the_reference() {
     let path = fake("dhd", "drive", &["-DWITH_DRD"]);
     let library = open_fake(&path);

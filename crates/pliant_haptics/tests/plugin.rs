@@ -2,7 +2,13 @@
 #![cfg(feature = "plugin")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
-use std::time::Duration;
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
 
 use bevy::{
     asset::AssetPlugin, math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin,
@@ -10,9 +16,9 @@ use bevy::{
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, TouchProbe};
 
 use pliant_haptics::{
-    DeviceId, Fault, HandModel, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool,
-    HapticsPlugin, HeldBy, LoopConfig, LoopState, ToolGrip, ToolPose, ToolTouch, VirtualConfig,
-    VirtualDevice, VirtualHandle,
+    DeviceId, DeviceInfo, Fault, HandModel, HapticButton, HapticDevice, HapticDevices, HapticFault,
+    HapticNotice, HapticTool, HapticsPlugin, HeldBy, LoopConfig, LoopState, Sample, Scheduler, ToolGrip,
+    ToolPose, ToolTouch, VirtualConfig, VirtualDevice, VirtualHandle, Wrench,
 };
 
 #[path = "rig/block.rs"]
@@ -301,6 +307,59 @@ fn a_stop_holds_for_devices_that_come_later() {
     s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
     assert!(!s.app.world().resource::<HapticDevices>().is_stopped());
     until(&mut s, "the later device gives its force", |s| devices(s)[1].1.length() > 1.0);
+}
+
+/// A device whose driver does not return while it is told so.
+struct Stuck {
+    inner: VirtualDevice,
+    stuck: Arc<AtomicBool>,
+}
+
+impl HapticDevice for Stuck {
+    fn info(&self) -> DeviceInfo {
+        self.inner.info()
+    }
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        while self.stuck.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        self.inner.exchange(wrench, scheduler)
+    }
+    fn safe_stop(&mut self) {
+        self.inner.safe_stop();
+    }
+}
+
+#[test]
+fn a_stop_is_reset_for_all_devices_or_for_none() {
+    let mut s = scene(false);
+    let stuck = Arc::new(AtomicBool::new(false));
+    let inner = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
+    let device = Stuck { inner, stuck: stuck.clone() };
+    let mut devices = s.app.world_mut().resource_mut::<HapticDevices>();
+    let other = devices.add(device, machine::patient()).unwrap();
+    let state = |s: &Scene, id| s.app.world().resource::<HapticDevices>().get(id).unwrap().report.state;
+    until(&mut s, "both run", |s| [s.device, other].iter().all(|id| state(s, *id) == LoopState::Running));
+    s.app.world().resource::<HapticDevices>().estop();
+    until(&mut s, "both stop", |s| [s.device, other].iter().all(|id| state(s, *id) == LoopState::Stopped));
+    stuck.store(true, Ordering::Relaxed);
+    let mut devices = s.app.world_mut().resource_mut::<HapticDevices>();
+    while devices.set_recording(other, true) {}
+    devices.reset_stop();
+    assert!(devices.is_stopped());
+    // The other loop goes on and stays stopped.
+    let ticks = |s: &Scene| s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.ticks;
+    let begun = ticks(&s);
+    until(&mut s, "periods of the other loop", |s| {
+        assert_eq!(state(s, s.device), LoopState::Stopped);
+        ticks(s) >= begun + 400
+    });
+    stuck.store(false, Ordering::Relaxed);
+    until(&mut s, "the driver returns", |s| state(s, other) == LoopState::Stopped);
+    s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
+    until(&mut s, "both run again", |s| {
+        [s.device, other].iter().all(|id| state(s, *id) == LoopState::Running)
+    });
 }
 
 #[test]

@@ -144,20 +144,20 @@ impl HeldPatches {
             _ => false,
         };
         let modal = self.modal.as_deref().filter(|_| stepped);
-        if let Some(modal) = modal {
+        if let Some(modal) = modal.filter(|modal| modal.has_all(model)) {
             forces.stored = modal.energy();
         }
         let dt = when.dt.min(2.0 * when.period);
-        for (i, (contact, slot)) in model.contacts().iter().zip(&mut self.slots).enumerate() {
+        for (contact, slot) in model.contacts().iter().zip(&mut self.slots) {
             let arm = tool.orientation * Vector3::from(contact.offset);
             let (proxy, speed) = slot.follow.advance(when.now, dt, model, contact);
             let at = tool.position + arm;
             let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
             let stored = |stretch: Vector3<f64>| 0.5 * stretch.dot(&(k * stretch)).max(0.0);
-            let (elastic, damping) = match modal {
-                Some(modal) => {
-                    forces.stored += modal.proxy(i).map_or(0.0, |proxy| stored(at - proxy));
-                    (modal.reaction(i), Vector3::zeros())
+            let (elastic, damping) = match modal.and_then(|modal| modal.reaction(contact.key)) {
+                Some([reaction, proxy]) => {
+                    forces.stored += stored(at - proxy);
+                    (reaction, Vector3::zeros())
                 }
                 None => {
                     forces.stored += stored(at - proxy);

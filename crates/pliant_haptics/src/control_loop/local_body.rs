@@ -8,7 +8,7 @@
 //! removed from the present copy.
 
 use nalgebra::Vector3;
-use pliant_modal::{Body, Coefficients, Frame, Integrator, State, StepError};
+use pliant_modal::{Body, Coefficients, Frame, GrabId, Integrator, State, StepError};
 
 use crate::{HeldGrab, LocalModel, MAX_CONTACTS, control_loop::tool::Tool};
 
@@ -70,8 +70,13 @@ impl ModalLocal {
     }
 
     /// Steps the copy with the tool at its present pose. Returns `false` if the copy could not be
-    /// stepped. The proxy model must then serve.
+    /// stepped, or if the update is about none of its grabs, and so about another body. The proxy
+    /// model must then serve.
     pub(crate) fn advance(&mut self, now: f64, steps: usize, tool: &Tool, model: &LocalModel) -> bool {
+        let contacts = model.contacts();
+        if !contacts.is_empty() && contacts.iter().all(|contact| self.grab(contact.key).is_none()) {
+            return false;
+        }
         if model.tick != self.received_tick {
             (self.received_tick, self.received_at) = (model.tick, now);
             if !self.correct(model) {
@@ -104,17 +109,23 @@ impl ModalLocal {
         true
     }
 
-    /// Returns the reaction of the tool's grab `index`, N, world axes.
-    pub(crate) fn reaction(&self, index: usize) -> Vector3<f64> {
-        let grab = self.held.get(index).copied().flatten();
-        let reaction = grab.and_then(|g| self.body.reaction(g.id).ok()).unwrap_or([0.0; 3]);
-        Vector3::from(reaction) * self.scale
+    /// Returns the number of a grab in the body, if the copy has it. Updates and copies reach the
+    /// loop on two ways, so an update may tell of other grabs.
+    fn grab(&self, key: u64) -> Option<GrabId> {
+        self.held.iter().flatten().find(|grab| grab.key == key).map(|grab| grab.id)
     }
 
-    /// Returns the position of the patch of the tool's grab `index` in the copy, m, world axes.
-    pub(crate) fn proxy(&self, index: usize) -> Option<Vector3<f64>> {
-        let grab = self.held.get(index).copied().flatten()?;
-        Some(Vector3::from(self.body.grab_position(grab.id).ok()?) * self.scale)
+    /// Returns whether the copy has all grabs of an update.
+    pub(crate) fn has_all(&self, model: &LocalModel) -> bool {
+        model.contacts().iter().all(|contact| self.grab(contact.key).is_some())
+    }
+
+    /// Returns the reaction of a grab, N, and the position of its patch in the copy, m, world axes.
+    /// It is `None` for a grab that the copy does not have.
+    pub(crate) fn reaction(&self, key: u64) -> Option<[Vector3<f64>; 2]> {
+        let id = self.grab(key)?;
+        let (reaction, proxy) = (self.body.reaction(id).ok()?, self.body.grab_position(id).ok()?);
+        Some([reaction, proxy].map(|x| Vector3::from(x) * self.scale))
     }
 
     /// Returns the energy that the copy could give back, J of the world.
@@ -243,6 +254,7 @@ mod tests {
     use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch, StepSettings};
 
     use super::*;
+    use crate::control_loop::held_patches::{HeldPatches, When};
     use crate::{Coupling, CouplingLimit, ToolMap, control_loop::local_model::ModelWriter};
 
     fn pip(gravity: [f64; 3]) -> Body {
@@ -264,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_is_about_its_time_whatever_periods_were_missed() {
+    fn a_model_is_about_its_time_whatever_periods_were_missed() {
         let mut copy = ModalLocal::new(&pip([0.0; 3]), &[], 1.0, 1000.0).unwrap();
         let model = LocalModel::default();
         // Every third call takes four periods at once.
@@ -306,6 +318,47 @@ mod tests {
             last = now[0];
         }
         assert!((last - x - 0.01).abs() < 1e-9, "{last}, {x}");
+    }
+
+    /// Updates and copies reach the loop on two ways, so for some periods an update tells of other
+    /// grabs than the copy has.
+    #[test]
+    fn a_copy_serves_only_the_grabs_that_it_has() {
+        let mut body = pip([0.0; 3]);
+        let (first, second) = (grab(&mut body, 76), grab(&mut body, 63));
+        let [x, y, z] = body.target(first).unwrap();
+        body.set_target(first, [x + 0.01, y, z]).unwrap();
+        (0..600).for_each(|_| {
+            body.step().unwrap();
+        });
+        let held = |key, id| HeldGrab { key, id, offset: body.target(id).unwrap() };
+        let held = [held(1, first), held(2, second)];
+        let copy = ModalLocal::new(&body, &held, 1.0, 1000.0).unwrap();
+        let (mut writer, mut model) = (ModelWriter::new(), LocalModel::sized_for(&body));
+        let (mut patches, tool) = (HeldPatches::new(None), Tool::new(ToolMap::default()));
+        patches.set_modal(Some(Box::new(copy)));
+        let mut now = 0.0;
+        let mut force = |model: &LocalModel| {
+            patches.take(model);
+            now += 1e-3;
+            patches.forces(When { now, dt: 1e-3, period: 1e-3 }, true, &tool, model).elastic
+        };
+        let [one, other] = [first, second].map(|id| Vector3::from(body.reaction(id).unwrap()));
+        writer.write(&body, &held, &coupling(), 1.0, 0.0, &mut model).unwrap();
+        let both = force(&model);
+        assert!((both - one - other).norm() < 0.01 * one.norm(), "{both:?}, {one:?} and {other:?}");
+        // The tool has released the first patch, and the copy still holds both.
+        writer.write(&body, &held[1..], &coupling(), 1.0, 0.0, &mut model).unwrap();
+        let left = force(&model);
+        assert!((left - other).norm() < 0.01 * one.norm(), "{left:?} instead of {other:?}");
+        // The tool has taken hold of another body with as many modes, at rest under its hand.
+        let mut another = pip([0.0; 3]);
+        let id = grab(&mut another, 30);
+        let held = HeldGrab { key: 3, id, offset: another.target(id).unwrap() };
+        another.step().unwrap();
+        writer.write(&another, &[held], &coupling(), 1.0, 0.0, &mut model).unwrap();
+        let strange = force(&model);
+        assert!(strange.norm() < 1e-3 * one.norm(), "{strange:?} of a body that is not held");
     }
 
     #[test]

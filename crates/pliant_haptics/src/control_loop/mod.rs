@@ -12,6 +12,7 @@ pub(crate) mod local_model;
 pub(crate) mod proxy;
 pub(crate) mod runner;
 pub(crate) mod scheduler;
+pub(crate) mod stop;
 pub(crate) mod supervisor;
 pub(crate) mod tool;
 pub(crate) mod touch;

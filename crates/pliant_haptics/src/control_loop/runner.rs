@@ -19,6 +19,7 @@ use crate::{
     control_loop::{
         cycle::Sink,
         heartbeat::{Done, Heartbeat, Phase},
+        stop::StopSwitch,
         supervisor::supervise,
     },
 };
@@ -40,23 +41,6 @@ enum LoopCommand {
     Modal(Option<Box<ModalLocal>>),
     ResetStop,
     Record(bool),
-}
-
-/// Presses the emergency stop of a loop, from any thread.
-#[derive(Debug, Clone)]
-pub struct StopSwitch(Arc<AtomicBool>);
-
-impl StopSwitch {
-    /// Cuts the force from the loop's next period on, or within 15 ms by the supervisor if the
-    /// driver does not answer. The stop is latched until [`HapticLoop::reset_stop`].
-    pub fn press(&self) {
-        self.0.store(true, Ordering::Release);
-    }
-
-    /// Returns whether the stop is pressed.
-    pub fn is_pressed(&self) -> bool {
-        self.0.load(Ordering::Acquire)
-    }
 }
 
 /// A running device and its loop. Dropping the value stops both.
@@ -118,7 +102,7 @@ impl HapticLoop {
         let (event_in, events) = rtrb::RingBuffer::new(EVENTS);
         let (record_in, records) = rtrb::RingBuffer::new(RECORDS);
         let (trash_in, trash) = rtrb::RingBuffer::new(COMMANDS);
-        let stop = StopSwitch(Arc::new(AtomicBool::new(false)));
+        let stop = StopSwitch::new();
         let quit = Arc::new(AtomicBool::new(false));
         let clock = LoopClock::start();
         let heartbeat = Heartbeat::new(clock.now());
@@ -295,10 +279,11 @@ impl HapticLoop {
     }
 
     /// Unlatches the emergency stop. The force then rises by the ramp. If the result is `false`,
-    /// the caller should retry.
+    /// because the loop has not processed earlier commands yet, the stop stays pressed, and the
+    /// caller should retry.
     pub fn reset_stop(&mut self) -> bool {
-        self.stop.0.store(false, Ordering::Release);
-        self.commands.push(LoopCommand::ResetStop).is_ok()
+        let has_room = !self.commands.is_full();
+        self.stop.reset(has_room, || self.commands.push(LoopCommand::ResetStop).is_ok())
     }
 
     /// Starts or stops the recording of every period, see [`records`](Self::records).
@@ -416,16 +401,9 @@ impl<D: HapticDevice> Inner<D> {
         }
         self.cycle.set_realtime(realtime.is_ok());
         let mut scheduler = RealScheduler::new(clock, rate);
+        let stop = self.stop.clone();
         while !self.quit.load(Ordering::Acquire) {
-            // A pressed switch takes precedence over a reset that is still in the queue.
-            while !self.trash.is_full()
-                && let Ok(command) = self.commands.pop()
-            {
-                self.obey(command);
-            }
-            if self.stop.is_pressed() {
-                self.cycle.emergency_stop();
-            }
+            stop.obey(self, Self::obey_all, |this| this.cycle.emergency_stop());
             if !self.trash.is_full()
                 && let Some(old) = self.cycle.take_trash()
             {
@@ -441,6 +419,15 @@ impl<D: HapticDevice> Inner<D> {
             }
             let report = *self.cycle.step(&mut scheduler, self.model.read(), &mut self.queues);
             self.report.write(report);
+        }
+    }
+
+    /// Does what the app has told, as long as there is room for what comes back to it.
+    fn obey_all(&mut self) {
+        while !self.trash.is_full()
+            && let Ok(command) = self.commands.pop()
+        {
+            self.obey(command);
         }
     }
 

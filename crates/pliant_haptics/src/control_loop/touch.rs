@@ -28,7 +28,7 @@ pub(crate) struct TouchForces {
 
 /// A plane between two updates.
 #[derive(Debug, Clone, Copy, Default)]
-struct Slot {
+struct TouchSlot {
     plane: TouchPlane,
     /// Height by which the plane lies behind the received one, m, and how fast this decays, m/s.
     lag: f64,
@@ -39,7 +39,7 @@ struct Slot {
     force: Vector3<f64>,
 }
 
-impl Slot {
+impl TouchSlot {
     /// Distance of the ball to the received plane after `age` seconds, m.
     fn gap(&self, center: &Vector3<f64>, radius: f64, age: f64) -> f64 {
         let at = Vector3::from(self.plane.point) + Vector3::from(self.plane.velocity) * age;
@@ -62,7 +62,7 @@ impl Slot {
 /// The contact of a tool's ball with the planes of the local model.
 #[derive(Debug, Default)]
 pub(crate) struct Touch {
-    slots: [Slot; MAX_PLANES],
+    slots: [TouchSlot; MAX_PLANES],
     count: usize,
     tick: u64,
     since: f64,
@@ -92,7 +92,7 @@ impl Touch {
         for (slot, plane) in self.slots.iter_mut().zip(model.planes()) {
             let last = old[..known].iter().find(|slot| slot.plane.key == plane.key);
             let touched = last.filter(|slot| slot.force.x > 0.0);
-            *slot = Slot { plane: *plane, ..touched.copied().unwrap_or_default() };
+            *slot = TouchSlot { plane: *plane, ..touched.copied().unwrap_or_default() };
             let gap = slot.gap(center, radius, 0.0);
             slot.lag = match touched {
                 Some(last) => last.gap(center, radius, age) + last.lag - gap,

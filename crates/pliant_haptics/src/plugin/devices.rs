@@ -180,14 +180,18 @@ impl HapticDevices {
     }
 
     /// Unlatches the emergency stop of all devices. The forces then rise by their ramps. The stop
-    /// stays latched if the queue of a loop was full.
+    /// stays latched, for all of them, if the queue of a loop was full.
     pub fn reset_stop(&mut self) {
         self.stopped.store(false, Ordering::Release);
+        let mut refused = false;
         for entry in &mut self.entries {
             if !entry.running.get().reset_stop() {
-                self.stopped.store(true, Ordering::Release);
+                refused = true;
                 warn!("{}: the emergency stop could not be reset, the loop is busy", entry.status.info.name);
             }
+        }
+        if refused {
+            self.estop();
         }
     }
 

@@ -119,7 +119,7 @@ pub struct ForceDimension {
     watchdog: Option<Watchdog>,
     id: Option<c_char>,
     info: DeviceInfo,
-    switch: Arc<ForceSwitch>,
+    switch: Arc<DhdForceSwitch>,
     renewal: Renewal,
     /// Whether the force was off at the last look at the status.
     off: bool,
@@ -129,7 +129,7 @@ pub struct ForceDimension {
 }
 
 /// Switches the force off from another thread.
-struct ForceSwitch {
+struct DhdForceSwitch {
     enable: unsafe extern "system" fn(c_uchar, c_char) -> c_int,
     /// Ends the robotic loop of DRD, which may be driving the device.
     stop: Option<unsafe extern "system" fn(bool, c_char) -> c_int>,
@@ -142,7 +142,7 @@ struct ForceSwitch {
     _library: Arc<Library>,
 }
 
-impl StopHandle for ForceSwitch {
+impl StopHandle for DhdForceSwitch {
     fn cut(&self) {
         self.cut.store(true, Ordering::Release);
         let Ok(id) = c_char::try_from(self.id.load(Ordering::Acquire)) else { return };
@@ -185,7 +185,7 @@ impl ForceDimension {
             let found = format!("{}.{}.{}.{}", v[0], v[1], v[2], v[3]);
             return Err(VendorError::Version { library: path, found, needed: "3" });
         }
-        let switch = Arc::new(ForceSwitch {
+        let switch = Arc::new(DhdForceSwitch {
             enable: api.enable,
             stop: robotic.map(|r| r.stop),
             id: AtomicI32::new(-1),

@@ -171,7 +171,7 @@ pub struct OpenHaptics {
     config: OpenHapticsConfig,
     handle: Option<Handle>,
     info: DeviceInfo,
-    switch: Arc<ForceSwitch>,
+    switch: Arc<HdForceSwitch>,
     renewal: Renewal,
     /// Whether the last force was sent too late, so that the next one must be zero.
     late: bool,
@@ -187,7 +187,7 @@ pub struct OpenHaptics {
 }
 
 /// Switches the force off from another thread.
-struct ForceSwitch {
+struct HdForceSwitch {
     api: OpenHapticsApi,
     /// The open device, or [`INVALID`].
     handle: AtomicU32,
@@ -201,10 +201,10 @@ struct ForceSwitch {
 /// Sends no force and switches the force output off, on the servo thread.
 ///
 /// # Safety
-/// `data` is one count of an `Arc<ForceSwitch>`, which this function takes over.
+/// `data` is one count of an `Arc<HdForceSwitch>`, which this function takes over.
 unsafe extern "system" fn cut_force(data: *mut c_void) -> c_uint {
     // SAFETY: the caller passes the count over.
-    let switch = unsafe { Arc::from_raw(data.cast_const().cast::<ForceSwitch>()) };
+    let switch = unsafe { Arc::from_raw(data.cast_const().cast::<HdForceSwitch>()) };
     let device = switch.handle.load(Ordering::Acquire);
     if device != INVALID {
         let api = switch.api;
@@ -222,7 +222,7 @@ unsafe extern "system" fn cut_force(data: *mut c_void) -> c_uint {
 }
 
 /// The handle that the loop's supervisor gets.
-struct HdStop(Arc<ForceSwitch>);
+struct HdStop(Arc<HdForceSwitch>);
 
 impl StopHandle for HdStop {
     fn cut(&self) {
@@ -256,7 +256,7 @@ impl StopHandle for HdStop {
 /// Input and output of a callback. The device keeps it at one place in memory, because a scheduler
 /// that is stuck may run the callback late.
 struct ScheduledFrame {
-    switch: Arc<ForceSwitch>,
+    switch: Arc<HdForceSwitch>,
     device: Handle,
     force: [f64; 3],
     /// Whether the force is to be zero, because it comes back or ends.
@@ -335,7 +335,7 @@ impl OpenHaptics {
             if cfg!(windows) { &["hd.dll"][..] } else { &["libHD.so", "libHD.so.3", "libHD.so.3.4"][..] };
         let (library, path) = load(config.library.as_ref(), names)?;
         let api = OpenHapticsApi::from(&library, &path)?;
-        let switch = Arc::new(ForceSwitch {
+        let switch = Arc::new(HdForceSwitch {
             api,
             handle: AtomicU32::new(INVALID),
             cut: AtomicBool::new(false),
