@@ -261,7 +261,7 @@ fn legend(message: &LogMsg, single: &BTreeSet<&str>) -> Option<LogMsg> {
 }
 
 fn area(path: &str) -> &str {
-    path.split('/').find(|part| !part.is_empty()).unwrap_or("figures")
+    path.split('/').find(|part| !part.is_empty()).unwrap_or("metrics")
 }
 
 fn capital(word: &str) -> String {

@@ -3,12 +3,13 @@
 use std::{
     collections::{HashMap, HashSet},
     sync::Arc,
-    time::{Instant, SystemTime},
+    time::SystemTime,
 };
 
 use bevy::{
     diagnostic::{DiagnosticPath, DiagnosticsStore},
     ecs::entity::EntityHashMap,
+    platform::time::Instant,
     prelude::*,
 };
 use crossbeam_channel::Receiver;
@@ -446,7 +447,7 @@ fn measure(
         let known = AREAS.iter().find(|(name, _)| *name == rest).map(|(_, path)| (*path).to_owned());
         let path = known.unwrap_or_else(|| match rest.contains('/') {
             true => rest.to_owned(),
-            false => format!("figures/{rest}"),
+            false => format!("metrics/{rest}"),
         });
         let figure = Arc::new(Metric { path, unit: diagnostic.suffix.trim().to_owned() });
         to.push((figure.clone(), measurement.value));

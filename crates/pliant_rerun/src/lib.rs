@@ -55,6 +55,7 @@ mod motion;
 #[cfg(feature = "net")]
 mod net;
 mod plugin;
+mod queue;
 mod recorder;
 mod scalars;
 mod stress;
@@ -65,6 +66,11 @@ mod tests_sinks;
 #[cfg(test)]
 mod tests_streams;
 mod worker;
+
+/// What threads share. A test puts a channel on loom's locks in its place.
+mod sync {
+    pub(crate) use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, TryIter, TrySendError, bounded};
+}
 
 pub use log_lines::log_layer;
 pub use plugin::{RerunColor, RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems};

@@ -8,7 +8,7 @@ use bevy::{math::DVec3, prelude::*};
 use pliant_body::{BodyState, Grab, VisualState};
 use pliant_net::{
     GrabRefused, GuestState, HandOf, NetGuest, NetHost, NetPeer, NetStats, PeerState, RemoteHands,
-    SessionClosed, User, UserJoined, UserLeft, Yourself,
+    SessionClosed, SessionFailed, User, UserJoined, UserLeft, Yourself,
 };
 
 use crate::{
@@ -22,6 +22,7 @@ pub(crate) fn log_users(
     mut left: MessageReader<UserLeft>,
     mut refused: MessageReader<GrabRefused>,
     mut closed: MessageReader<SessionClosed>,
+    mut failed: MessageReader<SessionFailed>,
     mut own: ResMut<RerunScalars>,
 ) {
     for user in joined.read() {
@@ -36,6 +37,9 @@ pub(crate) fn log_users(
     for session in closed.read() {
         own.warn(format!("the session ended: {}", session.reason));
     }
+    for session in failed.read() {
+        own.warn(format!("there is no session: {}", session.reason));
+    }
 }
 
 /// Returns the state of the session in words, and whether this app is in it. Returns `None` without
@@ -46,7 +50,6 @@ fn standing(
     peer: Option<&NetPeer>,
 ) -> Option<(String, bool)> {
     Some(match (host, guest, peer) {
-        (Some(host), ..) if host.has_ended() => ("the session is over".to_owned(), false),
         (Some(host), ..) => (format!("hosting, {} guests", host.guests().count()), true),
         (None, Some(guest), _) => match guest.state() {
             GuestState::Joining => ("joining".into(), false),
@@ -72,7 +75,8 @@ pub(crate) fn log_connection(
     mut logged: Local<String>,
 ) {
     let Some((standing, stands)) = standing(host.as_deref(), guest.as_deref(), peer.as_deref()) else {
-        return;
+        // The next session is logged anew, whatever it is.
+        return logged.clear();
     };
     if *logged == standing {
         return;

@@ -310,12 +310,7 @@ impl Plugin for RerunPlugin {
             self.schedule,
             (
                 crate::net::log_users
-                    .run_if(
-                        resource_exists::<Messages<pliant_net::UserJoined>>
-                            .and_then(resource_exists::<Messages<pliant_net::UserLeft>>)
-                            .and_then(resource_exists::<Messages<pliant_net::GrabRefused>>)
-                            .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
-                    )
+                    .run_if(resource_exists::<pliant_net::SessionState>)
                     .run_if(collect::somebody_listens),
                 crate::net::log_connection.run_if(collect::wants_text),
                 crate::net::log_metrics.run_if(collect::wants_metrics),

@@ -4,9 +4,10 @@
 use std::{
     collections::{HashMap, HashSet},
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
+use bevy::platform::time::Instant;
 use rerun::{
     Arrows3D, BarChart, Color, EntityPath, EntityPathPart, LineStrips3D, Mesh3D, Points3D, Quaternion,
     RecordingStream, RecordingStreamError, SeriesLines, TextLog, TextLogLevel, Transform3D, ViewCoordinates,

@@ -18,19 +18,20 @@ use bevy::{
     },
     prelude::*,
 };
-use crossbeam_channel::{Receiver, bounded};
+use crossbeam_channel::bounded;
 use pliant_body::{Grab, ModalBody};
 
 use crate::{
     RerunPlugin, RerunRecording, RerunScalars, RerunStats,
     collect::Collector,
     log_lines::Lines,
+    queue::{FrameReceiver, queue},
     tests::{app, numbers, recorder, rows, scratch, until, update_to},
     worker::{Message, Worker},
 };
 
 /// Returns an app whose sinks are queues that the test empties.
-fn app_to(name: &str, queues: &[usize]) -> (App, Vec<Receiver<Message>>) {
+fn app_to(name: &str, queues: &[usize]) -> (App, Vec<FrameReceiver<Message>>) {
     let path = scratch(name);
     let mut app = app(RerunPlugin::file(&path));
     let (workers, inboxes) = queues.iter().map(|&room| Worker::held(room)).unzip();
@@ -41,9 +42,9 @@ fn app_to(name: &str, queues: &[usize]) -> (App, Vec<Receiver<Message>>) {
 }
 
 /// Logs the messages of a queue and returns the recording.
-fn played(inbox: &Receiver<Message>) -> Vec<rerun::log::LogMsg> {
+fn played(inbox: &FrameReceiver<Message>) -> Vec<rerun::log::LogMsg> {
     let (mut recorder, stream, storage) = recorder();
-    for Message { frame, owed } in inbox.try_iter() {
+    for Message { frame, owed } in inbox.read() {
         if let Some(owed) = owed {
             recorder.catch_up(&frame, &owed).unwrap();
         }
@@ -67,7 +68,7 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
         {
             assert!(seen.len() < 20, "body and hand are there");
             app.update();
-            seen.extend(slow.try_iter());
+            seen.extend(slow.read());
         }
         // The sink stops reading, and its two places fill. Then the hand and the body are removed,
         // and lines are logged.
@@ -85,11 +86,11 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
             app.update();
         }
         assert_eq!(app.world().resource::<RerunStats>().dropped, 3);
-        seen.extend(slow.try_iter());
+        seen.extend(slow.read());
         app.update();
-        seen.extend(slow.try_iter());
-        let (again, inbox) = bounded(32);
-        seen.into_iter().for_each(|message| again.send(message).ok().unwrap());
+        seen.extend(slow.read());
+        let (mut again, inbox) = queue(32);
+        seen.into_iter().for_each(|message| again.offer(message).ok().unwrap());
         let messages = played(&inbox);
         assert_eq!(rows(&messages, "/world/square", "is_recursive"), 1, "the body does not stay as a ghost");
         assert_eq!(rows(&messages, "/reaction/hand", "is_recursive"), 1, "nor does the hand");
@@ -113,7 +114,7 @@ fn two_bodies_of_one_name_are_two_bodies() {
     app.world_mut().spawn((first, Name::new("square")));
     (0..3).for_each(|_| app.update());
     let paths: Vec<String> = inboxes[0]
-        .try_iter()
+        .read()
         .flat_map(|message| {
             message.frame.arrived.iter().map(|body| body.path.to_string()).collect::<Vec<_>>()
         })

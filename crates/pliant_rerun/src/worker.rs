@@ -12,11 +12,14 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread::JoinHandle,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
-use bevy::log::{debug, error, info, warn};
-use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
+use bevy::{
+    log::{debug, error, info, warn},
+    platform::time::Instant,
+};
+use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use rerun::{
     ApplicationId, RecordingStream, RecordingStreamBuilder, RecordingStreamError, SpawnOptions,
     log::ChunkBatcherConfig,
@@ -27,6 +30,7 @@ use crate::{
     RerunError,
     blueprint::Plots,
     frame::{Drawn, Owed, RecordedFrame},
+    queue::{FrameReceiver, FrameSender, Refused, queue},
     recorder::Recorder,
 };
 
@@ -75,33 +79,29 @@ pub(crate) struct Message {
 
 /// The app's handle of a worker.
 pub(crate) struct Worker {
-    frames: Option<Sender<Message>>,
-    /// Wakes the worker. Dropping the sender ends the worker.
-    nudge: Option<Sender<()>>,
+    frames: FrameSender<Message>,
     thread: Option<JoinHandle<()>>,
     ended: Receiver<()>,
     patience: Duration,
-    dropped: u64,
     owed: Option<Owed>,
 }
 
 impl Worker {
-    /// Starts a worker with room for `queue` frames.
+    /// Starts a worker with room for `room` frames.
     ///
     /// The file is created here, so that a wrong path is reported at once. Logged frames go to
     /// `spare`, so that their memory is reused.
     pub fn start(
         application: &str,
         target: &Target,
-        queue: usize,
+        room: usize,
         plots: Plots,
         spare: Sender<RecordedFrame>,
     ) -> Result<Self, RerunError> {
         let id = ApplicationId::try_from(application.to_owned())
             .map_err(|_| RerunError::Application { name: application.to_owned() })?;
         let builder = RecordingStreamBuilder::new(id);
-        let (frames, inbox) = bounded(queue.max(1));
-        let (nudge, nudged) = bounded(1);
+        let (frames, inbox) = queue(room);
         let (end, ended) = bounded(1);
         let patience = match target {
             Target::File { path, .. } => {
@@ -120,35 +120,22 @@ impl Worker {
                 // priority.
                 give_way();
                 match target.open(builder) {
-                    Some(stream) => {
-                        record(&stream, &target, MessageQueue { frames: inbox, nudged, spare }, plots)
-                    }
+                    Some(stream) => record(&stream, &target, (inbox, &spare), plots),
                     // Dropping the inbox shows the app that the sink is closed.
                     None => drop(inbox),
                 }
                 drop(end);
             })
             .map_err(RerunError::Thread)?;
-        Ok(Self {
-            frames: Some(frames),
-            nudge: Some(nudge),
-            thread: Some(thread),
-            ended,
-            patience,
-            dropped: 0,
-            owed: None,
-        })
+        Ok(Self { frames, thread: Some(thread), ended, patience, owed: None })
     }
 
     /// Returns a worker whose frames a test receives.
     #[cfg(test)]
-    pub fn held(queue: usize) -> (Self, Receiver<Message>) {
-        let (frames, inbox) = bounded(queue);
+    pub fn held(room: usize) -> (Self, FrameReceiver<Message>) {
+        let (frames, inbox) = queue(room);
         let (_, ended) = bounded(1);
-        let patience = Duration::ZERO;
-        let worker =
-            Self { frames: Some(frames), nudge: None, thread: None, ended, patience, dropped: 0, owed: None };
-        (worker, inbox)
+        (Self { frames, thread: None, ended, patience: Duration::ZERO, owed: None }, inbox)
     }
 
     /// Whether the thread has ended by itself, so that closing does not wait.
@@ -162,63 +149,51 @@ impl Worker {
     /// A worker that has ended accepts and drops nothing. A worker that missed something also gets
     /// the list of all bodies from `bodies`.
     pub fn offer(&mut self, frame: &Arc<RecordedFrame>, bodies: impl FnOnce() -> Vec<Arc<Drawn>>) -> bool {
-        let Some(frames) = &self.frames else { return false };
+        if self.frames.is_closed() {
+            return false;
+        }
         let owed = self.owed.take().map(|owed| Owed { bodies: bodies(), ..owed });
-        match frames.try_send(Message { frame: frame.clone(), owed }) {
-            Ok(()) => {
-                // The queue fills faster than the worker wakes, so the worker is woken early.
-                if frames.capacity().is_some_and(|room| 2 * frames.len() >= room)
-                    && let Some(nudge) = &self.nudge
-                {
-                    // If this channel is full, the worker is already being woken.
-                    nudge.try_send(()).ok();
-                }
-                true
-            }
-            Err(TrySendError::Full(Message { owed, .. })) => {
-                self.dropped += 1;
+        match self.frames.offer(Message { frame: frame.clone(), owed }) {
+            Ok(()) => true,
+            Err(Refused::Full(Message { owed, .. })) => {
                 let mut owed = owed.unwrap_or_default();
                 owed.add(frame);
                 self.owed = Some(owed);
                 false
             }
-            Err(TrySendError::Disconnected(_)) => {
-                self.frames = None;
-                false
-            }
+            Err(Refused::Closed) => false,
         }
     }
 
     /// Whether a frame would not be accepted.
     pub fn is_full(&self) -> bool {
-        self.frames.as_ref().is_none_or(Sender::is_full)
+        self.frames.is_full()
     }
 
     /// Counts a frame that was not made because all queues were full.
     pub fn miss(&mut self) {
-        if self.frames.is_some() {
-            self.dropped += 1;
+        if !self.frames.is_closed() {
+            self.frames.miss();
             self.owed.get_or_insert_default();
         }
     }
 
     /// Whether the sink is still open.
     pub fn listens(&self) -> bool {
-        self.frames.is_some()
+        !self.frames.is_closed()
     }
 
     /// Returns the number of frames dropped because the queue was full.
     pub fn dropped(&self) -> u64 {
-        self.dropped
+        self.frames.dropped()
     }
 
     /// Lets the worker log the queued frames and close its recording.
     pub fn close(&mut self) {
-        self.frames = None;
-        self.nudge = None;
+        self.frames.close();
         let Some(thread) = self.thread.take() else { return };
         match self.ended.recv_timeout(self.patience) {
-            Err(crossbeam_channel::RecvTimeoutError::Timeout) => {
+            Err(RecvTimeoutError::Timeout) => {
                 warn!("a recording did not end in {} s and is given up", self.patience.as_secs());
             }
             _ => {
@@ -263,30 +238,28 @@ fn give_way() {
     }
 }
 
-/// The worker's ends of its channels.
-struct MessageQueue {
-    frames: Receiver<Message>,
-    nudged: Receiver<()>,
-    spare: Sender<RecordedFrame>,
-}
-
 /// Logs until the app ends or the viewer is closed. The function owns the inbox: dropping the inbox
 /// shows the app that the sink is closed.
-fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots: Plots) {
+fn record(
+    stream: &RecordingStream,
+    target: &Target,
+    (inbox, spare): (FrameReceiver<Message>, &Sender<RecordedFrame>),
+    plots: Plots,
+) {
     let mut recorder = Recorder::new(stream.clone(), plots);
     let mut failing = false;
     let (mut sent, mut watched, mut measured) = (Instant::now(), Instant::now(), Instant::now());
     let lost = Arc::new(AtomicBool::new(false));
     let columns = if matches!(target, Target::File { .. }) { FILE_COLUMNS } else { VIEWER_COLUMNS };
     loop {
-        let ends = inbox.nudged.recv_timeout(PAUSE) == Err(RecvTimeoutError::Disconnected);
-        for Message { frame, owed } in inbox.frames.try_iter() {
+        let (goes_on, frames) = inbox.wait(PAUSE);
+        for Message { frame, owed } in frames {
             let mut logged = owed.map_or(Ok(()), |owed| recorder.catch_up(&frame, &owed));
             logged = logged.and(recorder.log(&frame));
             warn_once(logged, frame.tick, &mut failing);
             if let Some(frame) = Arc::into_inner(frame) {
                 // If there is no room, enough spare frames are waiting.
-                inbox.spare.try_send(frame.cleared()).ok();
+                spare.try_send(frame.cleared()).ok();
             }
             // The SDK accepts data for a closed viewer, so the connection must be checked. The
             // check also runs between ticks, because many ticks may wait.
@@ -304,7 +277,7 @@ fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots:
                 }
             }
         }
-        if ends {
+        if !goes_on {
             break;
         }
         if let Target::File { path, limit } = target
