@@ -98,11 +98,13 @@ picture materials materials
 picture free_bodies free_bodies
 picture falling falling
 picture walk walk
+picture touch touch
 picture feel feel
 picture two_hands two_hands
 # A slow renderer needs a while until the body is there.
 picture shared_body shared_body --seconds 25
 picture tug_of_war tug_of_war
+picture menu menu
 for scene in "$root"/assets/scenes/*.ron; do
     picture "scene-$(basename "$scene" .ron)" scene "$scene"
 done

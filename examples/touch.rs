@@ -186,25 +186,26 @@ fn write(
     scene: Res<Scene>,
     devices: Res<HapticDevices>,
     tools: Query<(&ToolPose, &ProbeState)>,
-    mut most: Local<f64>,
+    mut most: Local<(usize, f64)>,
 ) {
     let (Some(status), Ok((pose, probe))) = (devices.get(scene.device), tools.single()) else { return };
     let touched = probe.contacts().filter(|contact| contact.force != DVec3::ZERO).count();
     let sliding = probe.contacts().filter(|contact| contact.sliding).count();
-    *most = most.max(probe.force().length());
+    *most = (most.0.max(touched), most.1.max(probe.force().length()));
     let deep = probe.position().map_or(0.0, |at| at.distance(pose.position));
     readout.0 = format!(
         "{}: {:?}\n\
          coupling     {:6.0} N/m\n\
-         touches      {touched} ({sliding} slide)\n\
+         touches      {touched} ({sliding} slide), at most {}\n\
          on the ball  {:6.2} N, at most {:.2} N\n\
          in the hand  {:6.2} N\n\
          stretch      {:6.2} mm",
         status.info.name,
         status.report.state,
         status.coupling.stiffness,
+        most.0,
         probe.force().length(),
-        *most,
+        most.1,
         pose.force.length(),
         1e3 * deep,
     );

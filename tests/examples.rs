@@ -33,6 +33,9 @@ struct Run {
     /// Another example that is started before this one and ended after it.
     #[serde(default)]
     beside: Option<Beside>,
+    /// Variables of its environment. It has no display otherwise.
+    #[serde(default)]
+    environment: Vec<(String, String)>,
     /// Texts that the output must contain, in this order.
     prints: Vec<String>,
     /// Files that must exist afterward and must not be empty.
@@ -124,7 +127,7 @@ fn build_examples() {
         return;
     }
     let mut cargo = Command::new(env!("CARGO"));
-    cargo.args(["build", "-p", "pliant", "--examples"]).current_dir(ROOT);
+    cargo.args(["build", "-p", "pliant_examples", "--examples"]).current_dir(ROOT);
     if !cfg!(debug_assertions) {
         cargo.arg("--release");
     }
@@ -138,7 +141,13 @@ struct Started {
 }
 
 impl Started {
-    fn new(example: &str, arguments: &[String], folder: &Path, output: &str) -> Self {
+    fn new(
+        example: &str,
+        arguments: &[String],
+        environment: &[(String, String)],
+        folder: &Path,
+        output: &str,
+    ) -> Self {
         let output = folder.join(output);
         let file = File::create(&output).unwrap();
         let child = Command::new(program(example))
@@ -147,6 +156,7 @@ impl Started {
             .env_remove("DISPLAY")
             .env_remove("WAYLAND_DISPLAY")
             .env("XDG_CACHE_HOME", folder.join("cache"))
+            .envs(environment.iter().cloned())
             .stdin(Stdio::null())
             .stdout(file.try_clone().unwrap())
             .stderr(file)
@@ -200,9 +210,10 @@ fn run_in(run: &Run, folder: &Path) -> Result<(), String> {
     let beside = run
         .beside
         .as_ref()
-        .map(|beside| Started::new(&beside.example, &with(&beside.arguments, ""), folder, BESIDE));
+        .map(|beside| Started::new(&beside.example, &with(&beside.arguments, ""), &[], folder, BESIDE));
     let invite = beside.as_ref().map(Started::invite).transpose()?.unwrap_or_default();
-    let mut started = Started::new(&run.example, &with(&run.arguments, &invite), folder, "output.txt");
+    let mut started =
+        Started::new(&run.example, &with(&run.arguments, &invite), &run.environment, folder, "output.txt");
     let began = Instant::now();
     let status = loop {
         match started.child.try_wait().unwrap() {

@@ -23,11 +23,13 @@ use pliant::{
 const CRATES: [&str; 4] = ["pliant_body", "pliant_contact", "pliant_net", "pliant_haptics"];
 
 /// The public components and resources that are not registered, and why.
-const WITHOUT: [(&str, &str); 12] = [
+const WITHOUT: [(&str, &str); 14] = [
     ("BakeRequest", "may hold code of the game, which cannot be saved"),
     ("Bakery", "bakes that are running"),
     ("BodyState", "a solver that runs; a saved world has SavedState in its place"),
+    ("CarrierPort", "open connections"),
     ("DrawnSurface", "what is on the graphics card"),
+    ("FixedObstacles", "what a session asks when it begins; the next one asks anew"),
     ("GamepadSource", "a handle of a running device"),
     ("HapticDevices", "running devices with their threads"),
     ("HeldShapesCache", "a cache, which is made again"),
@@ -171,7 +173,7 @@ import! {
     Integrator, ModalAsset, ModalBody, ModalModel, NoPointerGrab, Obstacle,
     Patch, PliantBodyPlugin, PliantDisplaySystems, PliantGizmos, PliantPlugins, PliantSystems,
     PliantTick, PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld, ProbeState, Push,
-    Relaxation, Released, RideOn, RidingPlugin, SingleSteps, StepSettings,
+    Relaxation, Released, RideOn, RidingPlugin, SessionCommands, SessionState, SingleSteps, StepSettings,
     SurfaceAnchor, SurfaceDeformation, SurfaceDetail, SurfacePlace, SurfaceShading, Teleport,
     ToolGrabs, ToolGrip, ToolOffset, ToolPose, ToolTouch, TouchBodies, TouchProbe, VisualState,
 }

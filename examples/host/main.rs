@@ -36,17 +36,16 @@ struct Options {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
+    let stage = stage::Stage::with("host", options.stage)
+        .real_time()
+        .key("left mouse: pull the body")
+        .key("N: another network");
     session::end_on_terminate();
     // A hundred bots of `join` connect from one machine.
     let limits = Limits { per_address: 256, ..Limits::host() };
     let net = options.serve.open("host", limits)?;
     App::new()
-        .add_plugins(
-            stage::Stage::with("host", options.stage)
-                .real_time()
-                .key("left mouse: pull the body")
-                .key("N: another network"),
-        )
+        .add_plugins(stage)
         .add_plugins((PliantPlugins::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
         .insert_resource(Network(options.serve.network))

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use pliant::modal::ModalModel;
-use pliant::net::transport::{Endpoint, Event, JoinOptions};
+use pliant::net::transport::{Carrier, Endpoint, Event, JoinOptions};
 use pliant::net::{Emulation, Invite};
 use pliant::stream::wire::Datagram;
 use pliant::stream::{Channel, GuestEvent, GuestSession, GuestSessionConfig, PeerId, RecoveryConfig};

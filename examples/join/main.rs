@@ -34,7 +34,7 @@ use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
     CameraInterest, Invite, JoinConfig, JoinOptions, NetGuest, NetPlugin, RemoteBody, SessionClosed,
-    SessionJoined, SessionLost, SessionRecording, SharedBody,
+    SessionFailed, SessionJoined, SessionLost, SessionRecording, SharedBody,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -204,7 +204,8 @@ fn tell(
     mut lost: MessageReader<SessionLost>,
     mut closed: MessageReader<SessionClosed>,
     mut exit: MessageWriter<AppExit>,
-    guest: Res<NetGuest>,
+    mut failed: MessageReader<SessionFailed>,
+    guest: Option<Res<NetGuest>>,
     shown: Query<&SharedBody, (With<RemoteBody>, Added<VisualState>)>,
 ) {
     let now = time.elapsed_secs_f64();
@@ -223,7 +224,12 @@ fn tell(
     }
     for closed in closed.read() {
         println!("{now:6.2} s  over: {}", closed.reason);
-        // The end of a recording is a success, not an error.
-        exit.write(if guest.endpoint().is_none() { AppExit::Success } else { AppExit::error() });
+        // The end of a recording is a success, not an error. Without a guest the user has left.
+        let well = guest.as_ref().is_none_or(|guest| guest.is_replay());
+        exit.write(if well { AppExit::Success } else { AppExit::error() });
+    }
+    for failed in failed.read() {
+        println!("{now:6.2} s  {}", failed.reason);
+        exit.write(AppExit::error());
     }
 }

@@ -49,6 +49,7 @@ struct Options {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
+    let stage = stage::Stage::with("peers", options.stage).real_time().key("left mouse: pull the body");
     session::end_on_terminate();
     let number = options.name.bytes().map(u64::from).sum::<u64>();
     let joins = options.invite.is_some();
@@ -67,7 +68,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     if joins {
         app.world_mut().spawn(stage::Awaited);
     }
-    app.add_plugins(stage::Stage::with("peers", options.stage).real_time().key("left mouse: pull the body"))
+    app.add_plugins(stage)
         .add_plugins((PliantPlugins::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
         .insert_resource(Number(number))

@@ -65,6 +65,7 @@ fn main() -> AppExit {
         return AppExit::from_code(2);
     };
     let Some(file) = read(file) else { return AppExit::from_code(2) };
+    let mut stage = Stage::with("a scene from a file", options.stage).picture_at(4.0).key("left mouse: pull");
     let (file, scene) = match SceneFilePlugin::open(file.clone()).map(|scene| (file, scene)) {
         Ok(both) => both,
         Err(error) => return told(&error),
@@ -74,7 +75,6 @@ fn main() -> AppExit {
         println!("{invite}");
     }
     let description = file.scene();
-    let mut stage = Stage::with("a scene from a file", options.stage).picture_at(4.0).key("left mouse: pull");
     if let Some(view) = description.view {
         stage = stage.look(look(&view));
     }

@@ -9,6 +9,7 @@ mod options;
 mod run;
 mod text;
 mod view;
+mod window;
 
 use std::time::Duration;
 
@@ -23,7 +24,7 @@ use bevy::{
 use clap::Parser;
 
 pub use hands::draw_hand;
-pub use options::{Options, display};
+pub use options::Options;
 pub use run::{Awaited, Unattended};
 pub use text::Readout;
 pub use view::Look;

@@ -90,16 +90,19 @@ impl Options {
         }
     }
 
-    /// Falls back to no window if there is no display.
+    /// Falls back to no window if none can be opened and drawn in.
     pub fn settle(&mut self) -> Result<(), String> {
-        if !self.headless && !display() {
-            println!("No display is to be found: running --headless, and the scene plays by itself.");
+        if !self.headless
+            && let Some(fault) = fault()
+        {
+            if self.screenshot.is_some() {
+                return Err(format!("a screenshot needs a window, and there is none: {fault}"));
+            }
+            println!("No window: {fault}. Running --headless, and the scene plays by itself.");
             self.headless = true;
         }
         match &self.screenshot {
-            Some(_) if self.headless => {
-                Err("a screenshot needs a window, and there is none without a display".into())
-            }
+            Some(_) if self.headless => Err("a screenshot needs a window: leave out --headless".into()),
             // A file that cannot be written is reported before the scene is played.
             Some(file) => std::fs::write(file, []).map_err(|error| format!("{}: {error}", file.display())),
             None => Ok(()),
@@ -107,29 +110,10 @@ impl Options {
     }
 }
 
-/// Returns whether a window can be opened.
-pub fn display() -> bool {
-    if cfg!(any(target_os = "windows", target_os = "macos")) {
-        return true;
-    }
-    let set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
-    (set("DISPLAY") && x_answers()) || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
-}
-
-/// Returns whether the X server that DISPLAY names is listening.
-///
-/// A server on another machine is assumed to listen.
-#[cfg(unix)]
-fn x_answers() -> bool {
-    let display = std::env::var("DISPLAY").unwrap_or_default();
-    let Some(number) = display.strip_prefix(':').or_else(|| display.strip_prefix("unix:")) else {
-        return true;
-    };
-    let number = number.split('.').next().unwrap_or_default();
-    std::os::unix::net::UnixStream::connect(format!("/tmp/.X11-unix/X{number}")).is_ok()
-}
-
-#[cfg(not(unix))]
-fn x_answers() -> bool {
-    true
+/// Returns why no window can be opened and drawn in; `None` if one can.
+fn fault() -> Option<String> {
+    #[cfg(feature = "window")]
+    return super::window::fault();
+    #[cfg(not(feature = "window"))]
+    Some("the feature `window` is off".into())
 }

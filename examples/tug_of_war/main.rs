@@ -45,6 +45,12 @@ struct Options {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
+    let stage = stage::Stage::with("tug of war", options.stage)
+        .bare()
+        .real_time()
+        .picture_at(9.0)
+        .key("left mouse: pull on the left")
+        .key("arrows: pull on the right");
     let net = NetPlugin::host(HostConfig { name: "left".into(), ..default() })?;
     let invite = net.invite().cloned().ok_or("no invite")?;
     let other = Other::default();
@@ -52,14 +58,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let model = session::model("pip.modal".as_ref())?;
     let thread = guest::start(&invite, model, session::emulation(options.network, 5), other.clone())?;
     App::new()
-        .add_plugins(
-            stage::Stage::with("tug of war", options.stage)
-                .bare()
-                .real_time()
-                .picture_at(9.0)
-                .key("left mouse: pull on the left")
-                .key("arrows: pull on the right"),
-        )
+        .add_plugins(stage)
         .add_plugins((PliantPlugins::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
         .insert_resource(other.clone())

@@ -66,6 +66,7 @@
 //! | `contact` | no | obstacles that bodies touch, and bodies that touch each other |
 //! | `contact-mesh` | no | convex hulls and triangle meshes as obstacles |
 //! | `net` | no | sessions over QUIC |
+//! | `states` | no | the state of the session as a state of Bevy, with `net` |
 //! | `haptics` | no | haptic devices and the device loop |
 //! | `rerun` | no | the client of the rerun viewer |
 //! | `panel` | no | the live panel (egui) |
@@ -185,6 +186,8 @@ pub mod prelude {
         ToolGrip, ToolOffset, ToolPose, ToolTouch,
     };
     pub use crate::modal::{ModalModel, Patch};
+    #[cfg(feature = "net")]
+    pub use crate::net::{SessionCommands, SessionState};
 }
 
 /// Compiles the code of the README.
