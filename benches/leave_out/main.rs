@@ -1,4 +1,4 @@
-//! Cost of a scene without the features that it does not need: six typical scenes, each compiled
+//! Cost of a scene without the features that it does not need: ten scenes, each compiled
 //! with its own features.
 //!
 //! `python3 benches/leave_out/run.py` builds all scenes and writes the table. To run one scene by
@@ -22,9 +22,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use bevy::{app::PluginsState, diagnostic::DiagnosticsStore, ecs::schedule::Schedules, prelude::*};
+use bevy::{
+    app::PluginsState,
+    diagnostic::{DiagnosticPath, DiagnosticsStore},
+    ecs::schedule::Schedules,
+    prelude::*,
+};
 use clap::Parser;
-use pliant::body::AWAKE_BODIES;
+use pliant::body::{AWAKE_BODIES, STEP_TIME};
 use scene::{Scene, Work};
 
 #[derive(Parser)]
@@ -116,25 +121,28 @@ fn frames(app: &mut App, seconds: f64) -> Vec<f64> {
         .collect()
 }
 
+fn newest(app: &App, path: &DiagnosticPath) -> f64 {
+    let store = app.world().resource::<DiagnosticsStore>();
+    store.get(path).and_then(|found| found.measurement()).map_or(0.0, |newest| newest.value)
+}
+
 /// Measures frames: the time on the app's thread and the CPU time of the whole program.
 fn measure(app: &mut App, seconds: f64) -> String {
     let before = processor();
-    let (mut times, mut awake) = (Vec::new(), 0.0);
+    let (mut times, mut steps, mut awake) = (Vec::new(), Vec::new(), 0.0);
     for _ in 0..(seconds / 0.5).round().max(1.0) as usize {
         times.extend(frames(app, 0.5));
-        awake += app
-            .world()
-            .resource::<DiagnosticsStore>()
-            .get(&AWAKE_BODIES)
-            .and_then(|found| found.measurement())
-            .map_or(0.0, |newest| newest.value);
+        awake += newest(app, &AWAKE_BODIES);
+        steps.push(newest(app, &STEP_TIME));
     }
     let spent = (processor() - before) * 1e3 / times.len() as f64;
     awake /= (seconds / 0.5).round().max(1.0);
     times.sort_by(f64::total_cmp);
+    steps.sort_by(f64::total_cmp);
+    let step = steps[steps.len() / 2];
     let at = |part: f64| times[((times.len() - 1) as f64 * part) as usize];
     format!(
-        "{{\"frame_ms\": {:.4}, \"frame_ms_p99\": {:.4}, \"processor_ms\": {spent:.4}, \"awake\": {awake:.1}}}",
+        "{{\"frame_ms\": {:.4}, \"frame_ms_p99\": {:.4}, \"processor_ms\": {spent:.4}, \"awake\": {awake:.1}, \"step_ms\": {step:.4}}}",
         at(0.5),
         at(0.99)
     )

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What a scene costs, with what it does not need left out: six typical scenes, each compiled with its own features.
+"""What a scene costs, with what it does not need left out: eight typical scenes beside the engine alone, each compiled with its own features.
 
     python3 benches/leave_out/run.py [--only SCENE]... [--seconds S] [--one-engine] [--target-dir DIR] [-o FOLDER]
 
 For each scene: the crates that are compiled, the size of its program (release, stripped), the systems in its schedules, and what a frame costs at rest and at
-work. Writes leave-out.md and leave-out.csv. Five of the six compile the engine with another set of features: with --one-engine the engine and all that is not
+work. Writes leave-out.md and leave-out.csv. Most compile the engine with another set of features: with --one-engine the engine and all that is not
 ours is compiled once, with the features that the whole project asks of it, and the programs of scenes with a window are up to that much larger than they need be.
 """
 
@@ -12,13 +12,19 @@ import argparse, csv, datetime, json, os, pathlib, platform, shutil, subprocess,
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 SCENES = {
+    "engine": ("the engine alone, with a camera", ["window"]),
+    "bare": ("the engine alone, no picture", []),
     "solo": ("one body, pulled and looked at", ["window"]),
     "many": ("a thousand bodies of one model", ["window"]),
+    "crowd": ("a thousand bodies of one model, no picture", []),
+    "held": ("a thousand bodies of 60 modes, a hand at each, no picture", []),
     "host": ("a server of one body, no picture, one guest", ["net"]),
     "guest": ("a guest that sees and holds the host's body", ["window", "net"]),
     "haptics": ("one body that is felt, a device at 1 kHz", ["window", "haptics"]),
     "everything": ("all features: host, device, recording, bakes", ["window", "net", "haptics", "rerun", "panel", "bake"]),
 }
+# They are compiled with the crates of another scene, whose number and size are not the engine's own.
+ALONE = ["engine", "bare"]
 # Our own crates that ask something of the engine: with all of them chosen the engine's features are those of everything.
 OURS = ["pliant_rerun", "pliant_panel", "pliant_net", "pliant_haptics", "pliant_bake"]
 
@@ -42,6 +48,10 @@ def build(features, one_engine, target):
     return pathlib.Path(target) / "release/examples/leave_out"
 
 
+def called(features):
+    return "-".join(features) or "none"
+
+
 def stripped(program):
     with tempfile.TemporaryDirectory() as folder:
         copy = pathlib.Path(folder) / program.name
@@ -57,7 +67,7 @@ def main():
     parser.add_argument("--one-engine", action="store_true")
     parser.add_argument("--target-dir", default=os.environ.get("CARGO_TARGET_DIR", str(ROOT / "target")))
     parser.add_argument("--headless-target-dir", help="for the scene without a picture; default: --target-dir")
-    parser.add_argument("--programs", type=pathlib.Path, help="a folder with programs built before, each named by its features joined with '-'")
+    parser.add_argument("--programs", type=pathlib.Path, help="a folder with programs built before, each named by its features joined with '-', or none")
     parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "docs/report")
     args = parser.parse_args()
     rows, load, kept = [], [os.getloadavg()[0]], tempfile.TemporaryDirectory()
@@ -65,14 +75,14 @@ def main():
     for scene, (_, features) in SCENES.items():
         if args.only and scene not in args.only:
             continue
-        if args.programs and not (args.programs / "-".join(features)).is_file():
+        if args.programs and not (args.programs / called(features)).is_file():
             continue
         if args.programs:
-            programs[tuple(features)] = args.programs / "-".join(features)
+            programs[tuple(features)] = args.programs / called(features)
         elif tuple(features) not in programs:
             target = args.headless_target_dir if "window" not in features and args.headless_target_dir else args.target_dir
             # The next scene's program has the same name.
-            programs[tuple(features)] = shutil.copy(build(features, args.one_engine, target), pathlib.Path(kept.name) / "-".join(features))
+            programs[tuple(features)] = shutil.copy(build(features, args.one_engine, target), pathlib.Path(kept.name) / called(features))
     # Compiled first, measured then: nothing else of ours runs meanwhile.
     load.append(os.getloadavg()[0])
     for scene, (what, features) in SCENES.items():
@@ -80,7 +90,7 @@ def main():
             continue
         program = pathlib.Path(programs[tuple(features)])
         told = json.loads(subprocess.run([program, "--scene", scene, "--seconds", str(args.seconds)], check=True, capture_output=True, text=True).stdout)
-        row = {"scene": scene, "what": what, "features": " ".join(features), "crates": crates(features), "program_mb": stripped(program) / 1e6,
+        row = {"scene": scene, "what": what, "features": " ".join(features), "crates": crates(features), "program_mb": stripped(program) / 1e6, "ours": scene not in ALONE,
                "systems": told["systems"] - told["engine_systems"], "engine_systems": told["engine_systems"]}
         for phase in ("rest", "work"):
             row |= {f"{phase}_{name}": value for name, value in told[phase].items()}
@@ -97,15 +107,16 @@ def main():
     lines = ["# What a scene leaves out", "",
              f"{datetime.date.today()}, {os.cpu_count()} cores, {platform.machine()}; load of the machine {load[1]:.1f} when measuring began, {load[2]:.1f} at its end. Remade by "
              f"`python3 benches/leave_out/run.py{' --one-engine' if args.one_engine else ''}`.", "",
-             "| scene | features | crates | program, MB | systems of ours (of the engine) | a frame at rest, ms (99 %) | at work, ms (99 %) | processor a frame, rest / work, ms | bodies stepped, rest / work |",
-             "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"]
+             "| scene | features | crates | program, MB | systems of ours (of the engine) | a frame at rest, ms (99 %) | at work, ms (99 %) | the steps of a tick at work, ms | processor a frame, rest / work, ms | bodies stepped, rest / work |",
+             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"]
     for r in rows:
-        lines.append(f"| {r['scene']}: {r['what']} | {r['features'].replace(' ', ', ')} | {r['crates']} | {r['program_mb']:.1f} | {r['systems']} ({r['engine_systems']}) | "
-                     f"{r['rest_frame_ms']:.3f} ({r['rest_frame_ms_p99']:.2f}) | {r['work_frame_ms']:.3f} ({r['work_frame_ms_p99']:.2f}) | "
+        own = f"{r['crates']} | {r['program_mb']:.1f}" if r["ours"] else " | "
+        lines.append(f"| {r['scene']}: {r['what']} | {r['features'].replace(' ', ', ')} | {own} | {r['systems']} ({r['engine_systems']}) | "
+                     f"{r['rest_frame_ms']:.3f} ({r['rest_frame_ms_p99']:.2f}) | {r['work_frame_ms']:.3f} ({r['work_frame_ms_p99']:.2f}) | {r['work_step_ms']:.3f} | "
                      f"{r['rest_processor_ms']:.2f} / {r['work_processor_ms']:.2f} | {r['rest_awake']:.0f} / {r['work_awake']:.0f} |")
     for scene, (what, features) in SCENES.items():
         if not any(row["scene"] == scene for row in rows):
-            lines.append(f"| {scene}: {what} | {', '.join(features)} | {crates(features)} | not measured in this run |  |  |  |  |  |")
+            lines.append(f"| {scene}: {what} | {', '.join(features)} | {crates(features)} | not measured in this run |  |  |  |  |  |  |")
     lines += ["",
               "*Crates*: packages in the dependency tree with the scene's features, our own among them. *Program*: optimized, stripped, with all of the engine that a windowed game has; the "
               "scene without a picture has the engine without a renderer." + (" The engine and all that is not ours were compiled once, with the features that the whole project asks of them; "

@@ -1,4 +1,4 @@
-//! The six scenes: their plugins, their content and their work.
+//! The ten scenes: their plugins, their content and their work.
 
 use std::{error::Error, path::Path, sync::Arc};
 
@@ -18,10 +18,18 @@ use crate::partner::Partner;
 /// A typical scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Scene {
+    /// The engine of a game with a window, and nothing of Pliant (`window`).
+    Engine,
+    /// The engine without rendering, and nothing of Pliant (no feature).
+    Bare,
     /// One body that is pulled and rendered (`window`).
     Solo,
     /// A thousand bodies of one model (`window`).
     Many,
+    /// A thousand bodies of one model, without rendering (no feature).
+    Crowd,
+    /// A thousand bodies of 60 modes, each held by a hand, without rendering (no feature).
+    Held,
     /// A server of one body with one guest, without rendering (`net`).
     Host,
     /// A guest that renders and holds the host's body (`window`, `net`).
@@ -96,11 +104,13 @@ pub fn plugins(scene: Scene, app: &mut App) -> Result<Company, Box<dyn Error>> {
     let mut company = Company::default();
     // The features decide which fields exist, so `company` may stay unused.
     let _ = &mut company;
-    if scene != Scene::Host && !cfg!(feature = "window") {
+    let seen = !matches!(scene, Scene::Bare | Scene::Host | Scene::Crowd | Scene::Held);
+    if seen && !cfg!(feature = "window") {
         return Err(missing(scene, "window"));
     }
     match scene {
-        Scene::Host => app.add_plugins(PliantBodyPlugin::default()),
+        Scene::Engine | Scene::Bare => return Ok(company),
+        Scene::Host | Scene::Crowd | Scene::Held => app.add_plugins(PliantBodyPlugin::default()),
         _ => app.add_plugins(PliantPlugins::default()),
     };
     if matches!(scene, Scene::Host | Scene::Guest | Scene::Everything) {
@@ -146,6 +156,11 @@ pub fn ear(model: &ModalModel) -> u32 {
 
 /// Spawns the content of a scene.
 pub fn spawn(scene: Scene, app: &mut App, company: &mut Company) -> Result<(), Box<dyn Error>> {
+    if matches!(scene, Scene::Engine | Scene::Bare) {
+        #[cfg(feature = "window")]
+        look(app);
+        return Ok(());
+    }
     let pip = model("pip.modal")?;
     let side = ear(&pip);
     let place = Vec3::from(pip.surface().positions()[side as usize]);
@@ -153,13 +168,21 @@ pub fn spawn(scene: Scene, app: &mut App, company: &mut Company) -> Result<(), B
         app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model))
     };
     match scene {
-        Scene::Many => {
+        Scene::Many | Scene::Crowd => {
             let bud = add(model("bud.modal")?);
             for i in 0..1_000 {
-                let at = Vec3::new(0.22 * (i % 32) as f32 - 3.4, 0.0, 0.22 * (i / 32) as f32 - 3.4);
-                app.world_mut().spawn((ModalBody::new(bud.clone()), Transform::from_translation(at)));
+                app.world_mut().spawn((ModalBody::new(bud.clone()), in_rows(i)));
             }
             app.add_systems(FixedUpdate, shake.before(PliantSystems::Input));
+        }
+        Scene::Held => {
+            let handle = add(pip.clone());
+            for i in 0..1_000 {
+                let body = ModalBody { modes: Some(60), ..ModalBody::new(handle.clone()) };
+                app.world_mut().spawn((body, in_rows(i)));
+            }
+            app.insert_resource(Hand { vertex: side, from: place.as_dvec3(), grab: None });
+            app.add_systems(FixedUpdate, pull_all.before(PliantSystems::Input));
         }
         Scene::Guest => {
             #[cfg(feature = "net")]
@@ -187,6 +210,10 @@ pub fn spawn(scene: Scene, app: &mut App, company: &mut Company) -> Result<(), B
     #[cfg(feature = "window")]
     look(app);
     Ok(())
+}
+
+fn in_rows(i: u32) -> Transform {
+    Transform::from_xyz(0.22 * (i % 32) as f32 - 3.4, 0.0, 0.22 * (i / 32) as f32 - 3.4)
 }
 
 /// Adds a camera, because bodies that no camera sees are not deformed.
@@ -228,10 +255,38 @@ fn pull(
     }
 }
 
+/// A hand at every body, while there is work.
+fn pull_all(
+    mut commands: Commands,
+    work: Res<Work>,
+    time: Res<Time>,
+    hand: Res<Hand>,
+    bodies: Query<(Entity, &GlobalTransform), With<BodyState>>,
+    mut grabs: Query<(&mut Grab, &GrabOf)>,
+) {
+    if !work.0 {
+        return;
+    }
+    let t = time.elapsed_secs_f64();
+    let way = 0.04 * DVec3::new((3.0 * t).sin(), 0.5 * (4.1 * t).sin(), (2.3 * t).cos() - 1.0);
+    let target = |place: &GlobalTransform| place.translation().as_dvec3() + hand.from + way;
+    if grabs.is_empty() {
+        for (body, place) in &bodies {
+            commands.spawn((Grab::new(hand.vertex, 0.02, target(place)), GrabOf(body)));
+        }
+    }
+    for (mut grab, of) in &mut grabs {
+        if let Ok((_, place)) = bodies.get(of.0) {
+            grab.target = target(place);
+        }
+    }
+}
+
 /// Applies an impulse to every body ten times a second, so that none rests.
 fn shake(
     work: Res<Work>,
     mut tick: Local<u32>,
+    mut vertex: Local<Option<u32>>,
     bodies: Query<(Entity, &BodyState)>,
     mut blows: MessageWriter<Impulse>,
 ) {
@@ -239,7 +294,7 @@ fn shake(
     if work.0 && tick.is_multiple_of(6) {
         blows.write_batch(bodies.iter().map(|(body, state)| Impulse {
             body,
-            vertex: ear(state.model()),
+            vertex: *vertex.get_or_insert_with(|| ear(state.model())),
             impulse: DVec3::new(1e-3, 0.0, 5e-4),
         }));
     }

@@ -108,6 +108,8 @@ enum CliError {
     Threads { got: usize, most: usize },
     #[error("--output: the folder {0} is not there")]
     NoFolder(std::path::PathBuf),
+    #[error("--output: cannot write {path}: {source}")]
+    Output { path: std::path::PathBuf, source: std::io::Error },
     #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
     #[error("{0}")]

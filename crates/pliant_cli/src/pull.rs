@@ -27,6 +27,9 @@ pub(crate) struct PullArgs {
     /// Elasticity of the body: linear or reduced [default: reduced if the model has a material]
     #[arg(long, value_parser = elasticity)]
     elasticity: Option<Elasticity>,
+    /// Gravity, m/s^2
+    #[arg(long, value_name = "GX,GY,GZ", value_parser = three::<f64>, default_value = "0,0,0", allow_hyphen_values = true)]
+    gravity: [f64; 3],
     /// Writes the surface of the pulled body (.ply)
     #[arg(long, value_name = "OUT.ply")]
     surface: Option<PathBuf>,
@@ -40,7 +43,8 @@ pub(crate) fn run(args: &PullArgs) -> Result<(), CliError> {
         output::check_folder(path)?;
     }
     let model = Arc::new(ModalModel::read(&args.model)?);
-    let asked = Pull { at: args.at, radius: args.radius, by: args.by, elasticity: args.elasticity };
+    let PullArgs { at, radius, by, elasticity, gravity, .. } = *args;
+    let asked = Pull { at, radius, by, elasticity, gravity };
     let pulled = pull(&model, &asked)?;
     if let Some(path) = &args.surface {
         let positions = pulled.surface.iter().map(|p| p.map(f64::from)).collect();

@@ -12,8 +12,8 @@ const ALL: &str = "all";
 
 #[derive(Args, Debug)]
 pub(crate) struct ReportArgs {
-    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, table-2,
-    /// table-3, courses, default
+    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, elasticity,
+    /// table-2, table-3, courses, default
     #[arg(long, default_value = ALL)]
     only: String,
     /// Fewer points and shorter timings: within ten minutes on two cores

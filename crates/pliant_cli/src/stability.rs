@@ -1,7 +1,7 @@
 //! The command `pliant stability`: stiff, extreme and unfair cases, each with its bound and its
 //! margin.
 
-use std::fmt::Write;
+use std::{fmt::Write, path::PathBuf};
 
 use clap::Args;
 use pliant_lab::stability::{self, StabilityReport, StabilitySettings};
@@ -13,24 +13,31 @@ pub(crate) struct StabilityArgs {
     /// Only cases whose group or name contains this text
     #[arg(long, value_name = "TEXT")]
     only: Option<String>,
-    /// One case in eight, for the tests of the project. Takes seconds
-    #[arg(long)]
-    short: bool,
     /// Number of threads [default: one per core]
     #[arg(long)]
     threads: Option<usize>,
     /// Prints one line of JSON
     #[arg(long)]
     json: bool,
+    /// Writes the table as a page in Markdown, too
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
 }
 
 pub(crate) fn run(args: &StabilityArgs) -> Result<(), CliError> {
-    let settings = StabilitySettings { only: args.only.clone(), short: args.short, threads: args.threads };
+    let settings = StabilitySettings { only: args.only.clone(), threads: args.threads };
+    if let Some(path) = &args.output {
+        output::check_folder(path)?;
+    }
     let report = stability::run(&settings, &mut Bar::new())?;
     if report.cases.is_empty() {
         let got = args.only.clone().unwrap_or_default();
         let expected = "a text that the name or the group of a case holds".to_owned();
         return Err(CliError::Unknown { what: "--only", got, expected });
+    }
+    if let Some(path) = &args.output {
+        std::fs::write(path, report.page())
+            .map_err(|source| CliError::Output { path: path.clone(), source })?;
     }
     if args.json {
         output::print_json(&report)?

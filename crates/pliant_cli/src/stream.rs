@@ -24,7 +24,7 @@ use crate::{CliError, output};
 
 #[derive(Args, Debug)]
 #[command(
-    after_help = "hand_to_force_ms is reckoned, not timed: for force-driven repair and between peers it is one step by construction, as the own copy answers at its next step; else half the measured round trip, half a step and the measured delay of showing."
+    after_help = "hand_to_force_ms is measured between peers: the longest time from a position of the own hand to the first step whose force has it. Else it is reckoned: for force-driven repair one step by construction, as the own copy answers at its next step; for the others half the measured round trip, half a step and the measured delay of showing."
 )]
 pub(crate) struct StreamArgs {
     /// The body

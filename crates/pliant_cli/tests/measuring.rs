@@ -62,7 +62,10 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     assert_eq!((number(&paper, "lost"), number(&paper, "ticks") > 300.0), (22.0, true), "{paper}");
     for repair in ["rollback", "compensate"] {
         let told = more(&format!("--topology p2p --recovery {repair} --network wifi"));
-        assert!(number(&told, "ticks") > 300.0 && number(&told, "hand_to_force_ms") <= 25.0, "{told}");
+        // 18 s at 40 Hz. The peer's own hand is felt in the next step, 25 ms later at most. Its
+        // position changes every 5 ms, so that the oldest one that a step answers is 20 ms old.
+        assert!((715.0..=721.0).contains(&number(&told, "ticks")), "{told}");
+        assert!((15.0..=25.0).contains(&number(&told, "hand_to_force_ms")), "{told}");
     }
 
     let table = succeeds(&["stream", "--model", &model, "--loss", "burst:12@140", "--seconds", "10"]);
@@ -98,7 +101,7 @@ fn a_report_says_what_crosses_the_papers_networks() {
         .filter(|line| line.starts_with("| paper-"))
         .map(|line| line.split('|').map(str::trim).collect())
         .collect();
-    assert_eq!(rows.len(), 12, "{text}");
+    assert_eq!(rows.len(), 16, "{text}");
     for row in &rows {
         let number = |column: usize| row[column].parse::<f64>().unwrap();
         assert!((50.0..600.0).contains(&number(6)) && (20.0..300.0).contains(&number(7)), "{row:?}");
@@ -109,6 +112,12 @@ fn a_report_says_what_crosses_the_papers_networks() {
         100.0 * shown(&rows[2]) < shown(&rows[1]) && shown(&rows[1]) < shown(&rows[0]),
         "9 % lost: {text}"
     );
+    // Peers send targets only, which are far smaller than frames.
+    let bytes = |row: &[&str]| row[6].parse::<f64>().unwrap();
+    for network in rows.chunks(4) {
+        assert_eq!(network[3][5], "peers, rollback");
+        assert!(bytes(&network[3]) < 0.7 * bytes(&network[2]), "{network:?}");
+    }
     // Coarser frames must be smaller and less accurate, in each of the two lines.
     let text = part("frames");
     let points: Vec<(&str, f64, f64)> = text
@@ -122,6 +131,20 @@ fn a_report_says_what_crosses_the_papers_networks() {
     for pair in points.windows(2).filter(|pair| pair[0].0 == pair[1].0) {
         assert!(pair[0].1 < pair[1].1 && pair[0].2 > pair[1].2, "{pair:?}");
     }
+}
+
+/// Fastest of some hundred passes over as many bytes, GB/s.
+fn reads_gb_s(bytes: usize) -> f64 {
+    let source = vec![1u8; bytes];
+    let mut target = vec![0u8; bytes];
+    let pass = || {
+        let began = std::time::Instant::now();
+        target.copy_from_slice(std::hint::black_box(&source));
+        std::hint::black_box(&mut target);
+        began.elapsed().as_secs_f64()
+    };
+    let fastest = std::iter::repeat_with(pass).take(300).fold(f64::INFINITY, f64::min);
+    bytes as f64 / fastest.max(1e-9) * 1e-9
 }
 
 #[test]
@@ -142,12 +165,29 @@ fn a_body_is_timed_against_the_memory() {
         told["bytes"].as_u64().unwrap(),
         vertices.div_ceil(16) * (12 * 6 + 3) * 16 * 4 + 12 * vertices
     );
-    // The limit bounds the speed: nothing in the run was faster.
+    // The speed is that of the median surface: bytes per microsecond are megabytes per second.
+    let median = |told: &serde_json::Value, times: &str| told[times]["p50"].as_f64().unwrap();
     let [speed, limit] = ["bandwidth_gb_s", "bandwidth_limit_gb_s"].map(|key| told[key].as_f64().unwrap());
-    assert!(0.0 < speed && speed <= limit, "{told}");
-    // A frame consists of a step and a surface.
-    let median = |times: &str| told[times]["p50"].as_f64().unwrap();
-    assert!(median("frame_us") >= median("reconstruct_us"), "{told}");
+    let expected = told["bytes"].as_f64().unwrap() / median(&told, "reconstruct_us") * 1e-3;
+    assert!((speed / expected - 1.0).abs() < 1e-9, "{speed} GB/s instead of {expected}");
+    // The limit is that of this machine: reading as many bytes in this process, which fit in a
+    // cache, takes about as long.
+    let here = reads_gb_s(told["bytes"].as_u64().unwrap() as usize);
+    println!("{limit} GB/s told, {here} GB/s here");
+    assert!((here / 12.0..here * 12.0).contains(&limit), "{limit} GB/s told, {here} GB/s here");
+    // A frame is a step under a hand and a surface, and not one of them alone. The two medians need
+    // not add up to the byte, but the step must be in it.
+    let step = median(&told, "frame_us") - median(&told, "reconstruct_us");
+    let alone = median(&told, "step_us");
+    assert!((alone / 4.0..4.0 * alone).contains(&step), "a step of {step} us in a frame: {told}");
+    // Four times as many vertices and twice the modes take at least three times as long.
+    let (fine, finer) = (folder.file("fine.msh"), folder.file("fine.modal"));
+    succeeds(&["mesh", "bar", "--cells", "16,4,4", "--size", "1,0.2,0.2", "-o", &fine]);
+    succeeds(&["bake", &fine, "--element", "tet4", "--modes", "24", "--anchor", "x<0.01", "-o", &finer]);
+    let larger = json(&succeeds(&["bench", "step", &finer, "--seconds", "0.05", "--json"]));
+    let longer = median(&larger, "reconstruct_us") / median(&told, "reconstruct_us");
+    println!("a surface of 24 modes and four times the vertices takes {longer:.1} times as long");
+    assert!(longer > 3.0, "{larger}");
     let half = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--half", "--json"]));
     assert_eq!(
         half["bytes"].as_u64().unwrap(),
@@ -257,10 +297,11 @@ fn an_unchanged_bake_comes_from_the_cache() {
 }
 
 #[test]
-fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
-    let told = json(&succeeds(&["stability", "--short", "--json"]));
+fn the_stability_matrix_keeps_its_bounds_and_is_the_committed_page() {
+    let folder = Folder::new("stability");
+    let page = folder.file("stability.md");
+    let told = json(&succeeds(&["stability", "--json", "-o", &page]));
     let cases = told["cases"].as_array().unwrap();
-    assert!(cases.len() >= 30, "{}", cases.len());
     let (mut with_the_papers_scheme, mut limits) = (0, 0);
     for case in cases {
         // `known_limit` is set only if the result is the one that the limit expects. A limit that
@@ -272,7 +313,31 @@ fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
         limits += usize::from(limit);
         with_the_papers_scheme += usize::from(case["plain"].is_string());
     }
-    assert!(with_the_papers_scheme >= 5 && limits <= 2, "{with_the_papers_scheme}, {limits}");
+    assert!(with_the_papers_scheme >= 40 && limits == 12, "{with_the_papers_scheme}, {limits}");
+    let committed = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/report/stability.md");
+    let rows = |path: &str| -> Vec<(String, Option<f64>)> {
+        let text = std::fs::read_to_string(path).unwrap();
+        let row = |line: &str| {
+            let mut cells = line.split(" | ");
+            let name = cells.next().map(str::to_owned)?;
+            Some((name, cells.nth(1).and_then(|margin| margin.trim().parse().ok())))
+        };
+        text.lines().filter(|line| line.starts_with('|')).filter_map(row).collect()
+    };
+    let (now, then) = (rows(&page), rows(committed));
+    assert_eq!(now.len(), then.len());
+    for ((name, margin), (old_name, old)) in now.iter().zip(&then) {
+        assert_eq!(name, old_name);
+        // Digits far below the bounds differ from processor to processor.
+        if let (Some(margin), Some(old)) = (margin, old)
+            && margin != old
+            && *old < 1e3
+        {
+            assert!((0.8..=1.25).contains(&(margin / old)), "{name}: a margin of {margin}, told {old}");
+        }
+    }
+    let nowhere = folder.file("nowhere/stability.md");
+    assert!(refused(&["stability", "--only", "inputs", "-o", &nowhere]).contains("the folder"));
     // These are exactly the meshes that the bake rejects.
     let told = json(&succeeds(&["stability", "--only", "element shape", "--json"]));
     let limits: Vec<&str> = told["cases"]
@@ -292,6 +357,11 @@ fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
     assert!(message.contains("--only"), "{message}");
 }
 
+/// The mean number of runnable programs over the last minute, where the system tells it.
+fn load() -> Option<f64> {
+    std::fs::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
+}
+
 #[test]
 fn a_report_writes_its_words_numbers_and_pictures() {
     let folder = Folder::new("report");
@@ -304,10 +374,11 @@ fn a_report_writes_its_words_numbers_and_pictures() {
     }
     assert!(read("c-steps-free.png").starts_with(b"\x89PNG"));
     let text = String::from_utf8(read("report.md")).unwrap();
-    assert!(
-        text.contains("c-steps-held.svg") && text.contains("The error of the reference is about"),
-        "{text}"
-    );
+    // Each figure that is told is shown in the text.
+    for file in told["parts"][0]["files"].as_array().unwrap() {
+        let name = file.as_str().unwrap();
+        assert!(!name.ends_with(".svg") || text.contains(&format!("]({name})")), "{name}");
+    }
     // The exact integrator needs no small steps. At 60 Hz the error of a struck bar is rounding
     // only, and Newmark's error is more than a percent.
     let csv = String::from_utf8(read("c-steps-free.csv")).unwrap();
@@ -315,11 +386,19 @@ fn a_report_writes_its_words_numbers_and_pictures() {
         let row = csv.lines().find(|row| row.starts_with(&format!("\"{line}"))).unwrap();
         row.split(',').nth(2).unwrap().parse::<f64>().unwrap()
     };
-    assert!(error("exact") < 1e-10 && error("Newmark") > 0.01, "{csv}");
-    // If the system reports its load, the report must contain the measured load.
-    let measured =
-        text.contains("The load of the machine") || !std::path::Path::new("/proc/loadavg").exists();
-    assert!(measured && text.contains("| 99 % |"), "{text}");
+    assert!(error("exact") < 1e-12 && error("Newmark") > 0.01, "{csv}");
+    // If the system reports its load, the report must have the load at its end.
+    if let Some(load) = load() {
+        let (_, told) = text.split_once("at the start and ").unwrap();
+        let told: f64 = told.split(' ').next().unwrap().parse().unwrap();
+        assert!((told - load).abs() < 0.3 + 0.1 * load, "{told} told, {load} measured");
+    }
+    // The 99th percentile of a time is no less than its median.
+    let timed: Vec<Vec<f64>> = (text.lines())
+        .filter(|line| line.starts_with("| exact (default) |"))
+        .map(|line| line.split('|').filter_map(|cell| cell.trim().parse().ok()).collect())
+        .collect();
+    assert!(timed.len() >= 9 && timed.iter().all(|row| row.len() == 3 && row[0] <= row[1]), "{timed:?}");
     let message = refused(&["report", "--only", "nothing", "-o", &folder.file("out")]);
     assert!(message.contains("--only"), "{message}");
 }

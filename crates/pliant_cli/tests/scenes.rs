@@ -6,7 +6,7 @@
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
-use std::{collections::BTreeSet, process::Command};
+use std::{collections::BTreeSet, fs, path::Path, process::Command};
 
 /// The crates that a package compiles for this platform with these feature arguments.
 fn crates(package: &str, features: &[&str]) -> BTreeSet<String> {
@@ -184,6 +184,85 @@ fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
     for package in ["pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream", "pliant_lab"] {
         lacks(&crates(package, &[]), &["bevy*", "tokio", "quinn*", "rerun", "egui*"], package);
     }
+}
+
+/// The crates that a game in a browser may have. What the devices' loops are made of is native, and
+/// the laboratory and the program are no part of a game.
+const IN_BROWSERS: [&str; 10] = [
+    "pliant",
+    "pliant_mesh",
+    "pliant_bake",
+    "pliant_modal",
+    "pliant_stream",
+    "pliant_body",
+    "pliant_contact",
+    "pliant_net",
+    "pliant_rerun",
+    "pliant_panel",
+];
+
+/// The lines of a source, without its tests, that name the clock of the standard library.
+///
+/// A lint for types cannot tell: natively `bevy::platform::time::Instant` and `web_time::Instant`
+/// are the standard library's.
+fn standard_clocks(text: &str) -> Vec<String> {
+    let text = text.split("\n#[cfg(test)]").next().unwrap_or_default();
+    let whole = |line: &str| line.split(|c: char| !c.is_alphanumeric()).any(|word| word == "Instant");
+    text.split_inclusive(';')
+        .map(|statement| {
+            let lines = statement.lines().filter(|line| !line.trim_start().starts_with("//"));
+            lines.map(str::trim).collect::<Vec<_>>().join(" ")
+        })
+        .filter(|statement| {
+            let imports = statement.contains("use std::") && whole(statement);
+            imports || statement.contains("std::time::Instant") || statement.contains("use std::time;")
+        })
+        .collect()
+}
+
+/// Tests that nothing reads a clock that panics in browsers (`std::time::Instant::now`).
+#[test]
+fn clocks_are_those_that_browsers_have() {
+    for wrong in [
+        "use std::time::Instant;",
+        "use std::time::{Duration, Instant};",
+        "use std::{\n    fs,\n    time::{Duration, Instant},\n};",
+        "fn now() {\n    let now = std::time::Instant::now();\n}",
+        "use std::time;\nfn now() { time::Instant::now(); }",
+    ] {
+        assert_eq!(standard_clocks(wrong).len(), 1, "{wrong} is not found");
+    }
+    let right = "use std::time::Duration;\nuse bevy::platform::time::Instant;\n#[cfg(test)]\nmod tests {\n    \
+                 use std::time::Instant;\n}";
+    assert_eq!(standard_clocks(right), [""; 0], "what is right is found");
+
+    let (mut faults, mut seen) = (Vec::new(), 0);
+    for package in IN_BROWSERS {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(package).join("src");
+        let mut folders = vec![root];
+        while let Some(folder) = folders.pop() {
+            for entry in fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                let name = path.file_stem().unwrap().to_string_lossy().into_owned();
+                if name == "tests" || name.ends_with("_tests") {
+                    continue;
+                }
+                if path.is_dir() {
+                    folders.push(path);
+                    continue;
+                }
+                seen += 1;
+                let found = standard_clocks(&fs::read_to_string(&path).unwrap());
+                faults.extend(found.into_iter().map(|line| format!("{}: {line}", path.display())));
+            }
+        }
+    }
+    assert!(seen > 100, "only {seen} sources were found");
+    assert!(
+        faults.is_empty(),
+        "not bevy::platform::time::Instant or web_time::Instant:\n{}",
+        faults.join("\n")
+    );
 }
 
 #[test]

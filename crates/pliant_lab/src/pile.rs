@@ -63,6 +63,50 @@ pub struct Piled {
     pub failures: usize,
 }
 
+impl Pile {
+    /// Makes the bodies of the pile above the ground, which is their only obstacle.
+    ///
+    /// # Errors
+    /// Returns the errors of [`pile`].
+    pub fn bodies(&self, model: &Arc<ModalModel>) -> Result<Vec<Body>, LabError> {
+        let pile = self;
+        let range = |what, expected, sound: bool, got| {
+            if sound { Ok(()) } else { Err(ModelError::Value { what, index: 0, expected, got }) }
+        };
+        range("count", "1 to 1000 bodies", (1..=1000).contains(&pile.count), pile.count as f64)?;
+        range("rate", "1 to 1e6 steps a second", (1.0..=1e6).contains(&pile.rate), pile.rate)?;
+        let sound = pile.seconds > 0.0 && pile.seconds * pile.rate <= 1e6;
+        range("seconds", "above 0 and at most a million steps", sound, pile.seconds)?;
+        if !model.is_free() {
+            return Err(LabError::Anchored);
+        }
+        let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+        let elasticity = pile.elasticity.unwrap_or(of_model);
+        if elasticity == Elasticity::Reduced && model.material().is_none() {
+            return Err(LabError::NoMaterial);
+        }
+        let settings = StepSettings { elasticity, gravity: [0.0, -9.81, 0.0], ..StepSettings::default() };
+        let config = BodyConfig { step: 1.0 / pile.rate, ..settings.into() };
+        let mut bodies = Vec::with_capacity(pile.count);
+        for index in 0..pile.count {
+            let mut body = Body::new(model.clone(), config.clone())?;
+            body.set_friction(pile.friction)?;
+            body.set_obstacles(vec![Arc::new(Plane::GROUND)])?;
+            let (layer, column, row) = (index / 9, index % 3, index / 3 % 3);
+            // Layers are shifted, so that bodies fall between those below.
+            let aside = 0.3 * f64::from(layer as u32 % 2);
+            let place = Vector3::new(column as f64 + aside, 1.0 + 1.2 * layer as f64, row as f64 + aside);
+            let turn =
+                UnitQuaternion::from_scaled_axis(Vector3::new(0.7, 1.3, 0.4) * (0.3 * (index % 7) as f64));
+            let center = Vector3::from(model.center_of_mass());
+            let origin = 1.15 * model.size() * place - turn * center;
+            body.set_pose(origin.into(), [turn.i, turn.j, turn.k, turn.w])?;
+            bodies.push(body);
+        }
+        Ok(bodies)
+    }
+}
+
 /// Lets bodies of a model fall onto each other.
 ///
 /// # Errors
@@ -70,38 +114,7 @@ pub struct Piled {
 /// elasticity of a model that has no material, [`LabError::Model`] for a number out of its range,
 /// and [`LabError::Step`] when a body cannot be made.
 pub fn pile(model: &Arc<ModalModel>, pile: &Pile) -> Result<Piled, LabError> {
-    let range = |what, expected, sound: bool, got| {
-        if sound { Ok(()) } else { Err(ModelError::Value { what, index: 0, expected, got }) }
-    };
-    range("count", "1 to 1000 bodies", (1..=1000).contains(&pile.count), pile.count as f64)?;
-    range("rate", "1 to 1e6 steps a second", (1.0..=1e6).contains(&pile.rate), pile.rate)?;
-    let sound = pile.seconds > 0.0 && pile.seconds * pile.rate <= 1e6;
-    range("seconds", "above 0 and at most a million steps", sound, pile.seconds)?;
-    if !model.is_free() {
-        return Err(LabError::Anchored);
-    }
-    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
-    let elasticity = pile.elasticity.unwrap_or(of_model);
-    if elasticity == Elasticity::Reduced && model.material().is_none() {
-        return Err(LabError::NoMaterial);
-    }
-    let settings = StepSettings { elasticity, gravity: [0.0, -9.81, 0.0], ..StepSettings::default() };
-    let config = BodyConfig { step: 1.0 / pile.rate, ..settings.into() };
-    let mut bodies = Vec::with_capacity(pile.count);
-    for index in 0..pile.count {
-        let mut body = Body::new(model.clone(), config.clone())?;
-        body.set_friction(pile.friction)?;
-        body.set_obstacles(vec![Arc::new(Plane::GROUND)])?;
-        let (layer, column, row) = (index / 9, index % 3, index / 3 % 3);
-        // Layers are shifted, so that bodies fall between those below.
-        let aside = 0.3 * f64::from(layer as u32 % 2);
-        let place = Vector3::new(column as f64 + aside, 1.0 + 1.2 * layer as f64, row as f64 + aside);
-        let turn = UnitQuaternion::from_scaled_axis(Vector3::new(0.7, 1.3, 0.4) * (0.3 * (index % 7) as f64));
-        let center = Vector3::from(model.center_of_mass());
-        let origin = 1.15 * model.size() * place - turn * center;
-        body.set_pose(origin.into(), [turn.i, turn.j, turn.k, turn.w])?;
-        bodies.push(body);
-    }
+    let mut bodies = pile.bodies(model)?;
     let total = |bodies: &[Body]| -> f64 {
         let energy = |body: &Body| body.energy() + body.potential_energy() + body.contacts().report().energy;
         bodies.iter().map(energy).sum()

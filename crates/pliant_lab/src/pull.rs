@@ -35,6 +35,8 @@ pub struct Pull {
     pub by: [f64; 3],
     /// Elasticity of the body. `None`: reduced if the model has a material, linear otherwise.
     pub elasticity: Option<Elasticity>,
+    /// Gravity, m/s^2, in the model's axes. The hand takes hold of the straight body.
+    pub gravity: [f64; 3],
 }
 
 /// What the hand feels at the end of its way, when the body is at rest.
@@ -95,7 +97,8 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
     if elasticity == Elasticity::Reduced && model.material().is_none() {
         return Err(LabError::NoMaterial);
     }
-    let config = BodyConfig::from(StepSettings { elasticity, ..StepSettings::default() });
+    let config =
+        BodyConfig::from(StepSettings { elasticity, gravity: pull.gravity, ..StepSettings::default() });
     let step = config.step;
     let mut body = Body::new(model.clone(), config)?;
     let positions = model.surface().positions();

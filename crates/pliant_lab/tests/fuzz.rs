@@ -30,11 +30,11 @@ fn no_bytes_panic_a_parser_or_a_session() {
 #[ignore = "writes into the repository"]
 fn corpora_are_written() {
     use pliant_haptics::{Record, Recorder, Sample, VirtualConfig, Wrench};
-    use pliant_modal::GrabConfig;
+    use pliant_modal::{ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig};
     use pliant_stream::wire::{PROTOCOL_VERSION, PeerBodyState, PeerMessage};
     use pliant_stream::{
         Channel, DisconnectReason, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig, PeerId,
-        StepSettings, TickState,
+        StepSettings, Surroundings, TickState,
     };
     use support::protocol::direct;
 
@@ -63,6 +63,15 @@ fn corpora_are_written() {
     // A guest that joins without the model, takes hold and lets go.
     let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
     host.add_body(direct::BODY, "bar", support::bar(2, 0.05), StepSettings::default()).unwrap();
+    let shapes = [
+        FixedShape::Plane,
+        FixedShape::Ball { radius: 0.5 },
+        FixedShape::Box { half: [1.0, 2.0, 3.0], round: 0.25 },
+        FixedShape::Capsule { radius: 0.5, half_length: 1.0 },
+    ];
+    let obstacles = shapes.map(|shape| FixedObstacle { shape, ..FixedObstacle::GROUND }).to_vec();
+    let around = Surroundings { obstacles, ..Surroundings::default() };
+    host.set_surroundings(direct::BODY, around).unwrap();
     let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
     host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
     guest.connect(Duration::ZERO).unwrap();
@@ -112,6 +121,16 @@ fn corpora_are_written() {
         force: vec![0.0; 2],
         frame: None,
         pulls: Vec::new(),
+        contacts: ContactState {
+            memory: vec![ContactMemory {
+                obstacle: 1,
+                site: 2,
+                force: [0.0, 3.0, 0.0],
+                anchor: [0.5; 3],
+                toward: [0.0, -1.0, 0.0],
+            }],
+            ..ContactState::default()
+        },
     };
     for (name, message) in [
         (
@@ -127,7 +146,7 @@ fn corpora_are_written() {
         ),
         ("welcome", PeerMessage::Welcome { user: 2, others: vec![(3, "elsewhere".into())] }),
         ("request", PeerMessage::StateRequest),
-        ("state", PeerMessage::State { tick: 7, now: 9, bodies: vec![state] }),
+        ("state", PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![state] }),
         ("goodbye", PeerMessage::Goodbye { reason: DisconnectReason::Left }),
     ] {
         write("peers", name, &message.encode());

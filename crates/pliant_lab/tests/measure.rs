@@ -21,25 +21,61 @@ fn paper1(loss: Loss) -> LinkConfig {
     LinkConfig { loss, ..LinkConfig::preset(Preset::Paper1) }
 }
 
-/// A network of the design and its bounds, percent.
+/// Bounds of the default policy on a network, percent but for the last two.
+#[derive(Clone, Copy)]
+struct Bars {
+    /// Shape's error, root mean square and largest.
+    rms: f64,
+    max: f64,
+    /// Reactions' error, root mean square.
+    reactions: f64,
+    /// Ringing of the shown reactions, as a multiple of that of the true ones.
+    ringing: f64,
+    /// Number of ticks whose data came too late.
+    too_late: u64,
+}
+
+/// A network of the design and its bounds.
 struct Condition {
     name: &'static str,
     link: LinkConfig,
-    /// Bounds of the shape's error, root mean square and largest.
-    rms: f64,
-    max: f64,
-    /// Bound of the reactions' error in a minute, root mean square.
-    reactions: f64,
+    /// For a minute. The result is the same on each run, so that the bounds are a little above it.
+    minute: Bars,
+    /// For the worst of many sessions of ten minutes.
+    many: Bars,
 }
 
 fn conditions() -> [Condition; 4] {
-    let of = |name, link, rms, max, reactions| Condition { name, link, rms, max, reactions };
-    let (any, tick) = (f64::INFINITY, Duration::from_millis(25));
+    let bars = |rms, max, reactions, ringing, too_late| Bars { rms, max, reactions, ringing, too_late };
+    let of = |name, link, minute, many| Condition { name, link, minute, many };
+    let tick = Duration::from_millis(25);
     [
-        of("paper-1", LinkConfig::preset(Preset::Paper1), 0.2, 3.0, 0.4),
-        of("burst:12", paper1(Loss::Burst { first: 140, count: 12 }), any, 5.0, 0.2),
-        of("gilbert:4", paper1(Loss::gilbert(0.09, 4.0, tick)), 2.0, any, 1.1),
-        of("every:50", paper1(Loss::Every { first: 135, every: 50 }), 0.05, any, 0.01),
+        of(
+            "paper-1",
+            LinkConfig::preset(Preset::Paper1),
+            bars(0.065, 1.3, 0.3, 1.01, 0),
+            bars(0.07, 1.6, 0.3, 1.01, 0),
+        ),
+        of(
+            "burst:12",
+            paper1(Loss::Burst { first: 140, count: 12 }),
+            bars(0.065, 3.6, 0.18, 1.01, 0),
+            bars(0.021, 3.6, 0.055, 1.01, 0),
+        ),
+        // Blackouts of 20 ticks and more occur in ten minutes. After one, the removal of the error
+        // of the extrapolated force shows in the reaction, and some data comes too late.
+        of(
+            "gilbert:4",
+            paper1(Loss::gilbert(0.09, 4.0, tick)),
+            bars(0.35, 10.0, 1.0, 1.01, 0),
+            bars(0.5, 45.0, 4.2, 2.3, 40),
+        ),
+        of(
+            "every:50",
+            paper1(Loss::Every { first: 135, every: 50 }),
+            bars(0.0013, 0.009, 5e-4, 1.01, 0),
+            bars(0.0013, 0.009, 5e-4, 1.01, 0),
+        ),
     ]
 }
 
@@ -94,32 +130,36 @@ fn show(name: &str, f: &Metrics) {
     );
 }
 
-fn hold_bars(name: &str, seed: u64, f: &Metrics, rms: f64, max: f64) {
-    assert!(f.rms_percent <= rms, "{name}, seed {seed}: rms {} % above {rms} %", f.rms_percent);
-    assert!(f.max_percent <= max, "{name}, seed {seed}: max {} % above {max} %", f.max_percent);
-    assert!(f.kbit_s <= 100.0, "{name}, seed {seed}: {} kbit/s", f.kbit_s);
-    // The ringing must be as without loss. A change of sign in each step would give 4. (The
-    // scripted hands have a tremor, so the true ringing is not 0 either.)
-    let (shown, real) = (f.force_ringing, f.true_ringing);
-    assert!(shown < 1.1 * real, "{name}, seed {seed}: ringing {shown}, true {real}");
-    assert_eq!(f.counts.too_late, 0, "{name}, seed {seed}: data that came too late");
+/// What is above its bound.
+fn above(bars: &Bars, f: &Metrics) -> Vec<String> {
+    let all = [
+        ("rms %", f.rms_percent, bars.rms),
+        ("max %", f.max_percent, bars.max),
+        ("reactions %", f.force_rms_percent, bars.reactions),
+        // A change of sign in each step would give 4. (The scripted hands have a tremor, so the
+        // true ringing is not 0 either.)
+        ("ringing / true", f.force_ringing / f.true_ringing, bars.ringing),
+        ("too late", f.counts.too_late as f64, bars.too_late as f64),
+        ("kbit/s", f.kbit_s, 93.0),
+    ];
+    let missed = all.iter().filter(|(_, got, bar)| got.is_nan() || got > bar);
+    missed.map(|(what, got, bar)| format!("{what}: {got} of {bar}")).collect()
 }
 
 #[test]
 fn default_policy_holds_its_bars() {
-    for Condition { name, link, rms, max, reactions } in conditions() {
+    for Condition { name, link, minute, .. } in conditions() {
         for seed in 1..=2 {
             let f = run(&link, "default", 60.0, seed);
             show(name, &f);
-            hold_bars(name, seed, &f, rms, max);
-            let off = f.force_rms_percent;
-            assert!(off <= reactions, "{name}, seed {seed}: reactions off by {off} % of {reactions} %");
+            let missed = above(&minute, &f);
+            assert!(missed.is_empty(), "{name}, seed {seed}: {missed:?}");
         }
     }
 }
 
 #[test]
-fn burst_is_recovered_within_200_ms_of_the_first_arrival() {
+fn burst_is_recovered_when_the_first_frame_arrives() {
     let mut e = Experiment::new(
         bar(120, 0.05),
         paper1(Loss::Burst { first: 140, count: 12 }),
@@ -129,14 +169,17 @@ fn burst_is_recovered_within_200_ms_of_the_first_arrival() {
     let f = e.run().unwrap();
     // The predicted ticks end where the first frame after the burst arrives. After that, the
     // position of the hand's patch shows the error.
-    let scale = f.track.iter().map(|t| t.1.abs()).fold(0.0, f64::max);
-    let off: Vec<u64> = f.track.iter().filter(|t| (t.1 - t.2).abs() > 0.005 * scale).map(|t| t.0).collect();
+    let scale = f.track.iter().map(|t| t.displacement[0].abs()).fold(0.0, f64::max);
+    let wrong = f.track.iter().filter(|t| (t.displacement[0] - t.displacement[1]).abs() > 0.005 * scale);
+    let off: Vec<u64> = wrong.map(|t| t.tick).collect();
     let (Some(first), Some(last)) = (off.first(), off.last()) else { panic!("the burst does not show") };
     // Twelve ticks are lost. One tick of playout delay and three repeats leave at most nine
     // predicted ticks.
     let after = (last - first) as f64 * 25.0 - 12.0 * 25.0;
     println!("{} ticks are off, the last {after} ms after the first arrival", off.len());
-    assert!(after <= 200.0, "{after} ms after the first arrival: ticks {first} to {last}");
+    // The blend of six ticks hides what arrives, so that the last wrong tick at the hand is before
+    // the first arrival. One tick later would be a tick of playout delay lost.
+    assert!(after <= -100.0 && off.len() <= 7, "{after} ms after the first arrival: {first} to {last}");
 }
 
 #[test]
@@ -144,8 +187,13 @@ fn peers_see_one_shape_over_the_papers_worst_network() {
     let link = LinkConfig::preset(Preset::Paper1);
     let f = run_peers(&link, LateInputRepair::Rollback, 30.0);
     show("p2p rollback", &f);
-    assert!(f.ticks > 1100, "{}", f.ticks);
-    assert!(f.rms_percent < 2.0 && f.end_percent < 10.0, "rms {} %, end {} %", f.rms_percent, f.end_percent);
+    // 30 s at 40 Hz, without the last ones, on which nobody agrees yet.
+    assert!((1170..=1200).contains(&f.ticks) && f.missing == 0, "{} ticks, {} missing", f.ticks, f.missing);
+    assert!(f.rms_percent < 0.3 && f.max_percent < 1.8, "rms {} %, max {} %", f.rms_percent, f.max_percent);
+    assert!(f.force_rms_percent < 3.0, "reactions {} %", f.force_rms_percent);
+    // The own hand is felt in the next step. Its position is set every 5 ms, so that the oldest one
+    // that a step of 25 ms answers is 20 ms old.
+    assert!((15.0..=25.0).contains(&f.hand_to_force_ms), "{} ms", f.hand_to_force_ms);
     assert_eq!(f.hash, run_peers(&link, LateInputRepair::Rollback, 30.0).hash, "same seed, same session");
 }
 
@@ -266,22 +314,15 @@ fn default_policy_holds_its_bars_for_ten_minutes_on_many_seeds() {
         );
     };
     let mut missed = Vec::new();
-    for Condition { name, link, rms, max, .. } in conditions() {
+    for Condition { name, link, many, .. } in conditions() {
         let ours = worst(&link, "default", seconds, seeds);
         line(name, "default", &ours);
         let paper = worst(&link, "paper", seconds, seeds.div_ceil(10));
         line(name, "paper", &paper);
         let times = (paper.rms_percent / ours.rms_percent, paper.max_percent / ours.max_percent);
         println!("| {name} | times better | {:.0} | {:.0} |  |  |  |  |  |  |", times.0, times.1);
-        if ours.rms_percent > rms || ours.max_percent > max || ours.kbit_s > 100.0 {
-            missed.push(format!(
-                "{name}: rms {} % of {rms}, max {} % of {max}",
-                ours.rms_percent, ours.max_percent
-            ));
-        }
-        if ours.force_ringing > 1.1 * ours.true_ringing || ours.counts.too_late > 0 {
-            missed.push(format!("{name}: ringing {}, too late {}", ours.force_ringing, ours.counts.too_late));
-        }
+        println!("| {name} | too late | {} |  |  |  |  |  |  |  |", ours.counts.too_late);
+        missed.extend(above(&many, &ours).into_iter().map(|miss| format!("{name}: {miss}")));
     }
     assert!(missed.is_empty(), "{missed:?}");
 }

@@ -205,3 +205,67 @@ fn anothers_soft_hand_on_a_free_body_is_predicted_as_soft_as_it_is() {
     assert!(place < 0.005, "{place}");
     assert!(force < 0.05, "{force}");
 }
+
+#[test]
+fn anothers_soft_hand_on_an_anchored_body_is_predicted_as_soft_as_it_is() {
+    // One guest swings the free end of a bar on a soft, damped spring, and the other one shakes it
+    // close by. The patch of the first hand gives way to the second one, and the copy of the second
+    // guest has to know that. Compare it with the host's later state of the same ticks.
+    let model = bar(40, 0.05);
+    let (mut pair, scene) = start(&model);
+    let (mut seen, mut user) = (Vec::new(), None);
+    let look = |now: Duration, guest: usize, stepped: u64, session: &mut GuestSession| {
+        let Some(view) = session.body(BODY).filter(|_| guest == 1 && stepped > 0 && now > 6 * S) else {
+            return;
+        };
+        let Some(own) = view.predicted_hand() else { return };
+        user = session.user();
+        seen.extend(own.reaction(0).map(|f| (own.tick(), own.visual().q.clone(), f)));
+    };
+    let mut world = Observed { scene, look };
+    let soft = GrabConfig { stiffness: Some(50.0), relaxation: 0.02 };
+    let mut swing = circling_with(soft);
+    let mut grab = None;
+    world.scene.hand = Box::new(move |now, guest, session| {
+        swing(now, guest, session);
+        if guest != 1 || session.user().is_none() {
+            return;
+        }
+        let t = now.as_secs_f64();
+        let target = [0.9, 0.08 + 0.1 * (3.1 * t).sin(), 0.08 + 0.1 * (2.3 * t).sin()];
+        match grab {
+            None => grab = session.begin_grab(now, BODY, 58, 0.05, target, soft).ok(),
+            Some(grab) => session.set_target(grab, target).unwrap(),
+        }
+    });
+    let path = PathConfig::symmetric(LinkConfig::preset(Preset::Paper2));
+    for seed in [3, 4] {
+        pair.join_with(GuestSessionConfig::default(), path.clone(), seed, cached(&model)).unwrap();
+    }
+    pair.run_until(25 * S, &mut world);
+    let scene = &world.scene;
+    let key = GrabKey { user: user.expect("the second guest has joined"), grab: 0 };
+    let far2 = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
+    let (mut shape, mut force, mut strongest, mut count) = (0.0, 0.0, 0.0f64, 0.0);
+    for (tick, q, reaction) in &seen {
+        let Some((_, truth)) = scene.truth.iter().find(|t| t.0 == *tick) else { continue };
+        let Some((_, _, right)) = scene.reactions.iter().find(|r| r.0 == *tick && r.1 == key) else {
+            continue;
+        };
+        shape += far2(q, truth);
+        force += far2(reaction, right);
+        strongest = strongest.max(far2(right, &[0.0; 3]));
+        count += 1.0;
+    }
+    assert!(count > 500.0, "{count} ticks compared");
+    let shape = (shape / count).sqrt() / scene.size();
+    let force = (force / count / strongest).sqrt();
+    println!(
+        "shape off by {:.2} % of the largest, own force by {:.2} % of {:.3} N",
+        100.0 * shape,
+        100.0 * force,
+        strongest.sqrt()
+    );
+    assert!(shape < 0.01, "{shape}");
+    assert!(force < 0.03, "{force}");
+}

@@ -47,7 +47,13 @@ fn a_guest_sees_a_reduced_body_as_well_as_a_linear_one() {
 #[test]
 fn a_pull_says_which_elasticity_it_had() {
     let model = bar(Some(Material::NeoHookean));
-    let asked = Pull { at: [0.4, 0.04, 0.04], radius: 0.05, by: [0.0, 0.12, 0.0], elasticity: None };
+    let asked = Pull {
+        at: [0.4, 0.04, 0.04],
+        radius: 0.05,
+        by: [0.0, 0.12, 0.0],
+        elasticity: None,
+        gravity: [0.0; 3],
+    };
     let reduced = pull(&model, &asked).unwrap();
     assert!(reduced.elasticity == Elasticity::Reduced && reduced.material == Some(Material::NeoHookean));
     assert!(reduced.at_rest);
@@ -59,4 +65,31 @@ fn a_pull_says_which_elasticity_it_had() {
     assert_eq!(pull(&plain, &asked).unwrap().elasticity, Elasticity::Linear);
     let wanted = Pull { elasticity: Some(Elasticity::Reduced), ..asked };
     assert!(matches!(pull(&plain, &wanted), Err(LabError::NoMaterial)));
+}
+
+/// A hand that keeps the end of a clamped bar where it is bears three eighths of the bar's weight
+/// (a propped cantilever under uniform load: any table of beams).
+#[test]
+fn a_hand_bears_its_part_of_the_weight() {
+    let (side, gravity) = (0.05, -0.1);
+    let mesh = shapes::bar([20, 2, 2], [1.0, side, side]).unwrap();
+    let anchors = vec!["x<1e-9".parse().unwrap()];
+    let material = Some(Material::NeoHookean);
+    let config =
+        BakeConfig { modes: 20, young: 2.9e6, density: 1000.0, material, anchors, ..Default::default() };
+    let model = Arc::new(bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model);
+    let asked = Pull {
+        at: [1.0, 0.5 * side, 0.5 * side],
+        radius: 0.03,
+        by: [0.0; 3],
+        elasticity: None,
+        gravity: [0.0, gravity, 0.0],
+    };
+    let weight = 1000.0 * side * side * gravity;
+    for elasticity in [Elasticity::Linear, Elasticity::Reduced] {
+        let held = pull(&model, &Pull { elasticity: Some(elasticity), ..asked }).unwrap();
+        let share = held.reaction[1] / weight;
+        println!("{elasticity}: {share:.5} of the weight");
+        assert!(held.at_rest && (share / 0.375 - 1.0).abs() < 0.02, "{elasticity}: {share}");
+    }
 }

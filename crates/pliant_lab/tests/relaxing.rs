@@ -76,7 +76,7 @@ fn peers_step_a_relaxing_body_together() {
 
 /// Errors of a receiver that starts with a wrong viscoelastic state: per tick, the relative errors
 /// of the shape and of the viscoelastic state.
-fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
+fn wrong_state(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let model = bar(24, 0.05);
     let integrator = recovery.integrator();
     let settings = StepSettings { integrator, relaxation: Some(MATERIAL), ..Default::default() };
@@ -118,7 +118,7 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
         let Some(receiver) = &mut receiver else {
             encoder.restart(&state);
             let mut snapshot = encoder.snapshot(false);
-            assert_eq!(snapshot.z.len(), 24, "a snapshot carries the flow");
+            assert_eq!(snapshot.z.len(), 24, "a snapshot carries the viscoelastic state");
             snapshot.z.fill(0.0);
             receiver =
                 Some(Receiver::new(model.clone(), settings, 24, newmark, recovery, &snapshot).unwrap());
@@ -140,17 +140,21 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
 }
 
 #[test]
-fn a_wrong_flow_is_forgotten_by_every_policy_and_put_right_by_slices() {
+fn a_wrong_state_is_forgotten_by_every_policy_and_put_right_by_slices() {
     for (name, refresh, after) in [("default", 0, 400), ("default", 15, 40), ("paper", 0, 400)] {
         let recovery = RecoveryConfig { refresh, snapshots: false, ..RecoveryConfig::by_name(name).unwrap() };
-        let errors = wrong_flow(&recovery, after);
+        let errors = wrong_state(&recovery, after);
         let (first, last) = (errors[0], errors[errors.len() - 1]);
         println!(
-            "{name}, refresh {refresh}: flow off by {:.3}, then {:.1e}; shape {:.1e}, then {:.1e}",
+            "{name}, refresh {refresh}: viscoelastic state off by {:.3}, then {:.1e}; shape {:.1e}, then {:.1e}",
             first.1, last.1, first.0, last.0
         );
-        assert!(first.1 > 0.1, "{name}: the flow must be wrong to begin with: {}", first.1);
-        assert!(last.1 < 2e-3, "{name}, refresh {refresh}: flow off by {} after {after} ticks", last.1);
+        assert!(first.1 > 0.1, "{name}: the viscoelastic state must be wrong to begin with: {}", first.1);
+        assert!(
+            last.1 < 2e-3,
+            "{name}, refresh {refresh}: viscoelastic state off by {} after {after} ticks",
+            last.1
+        );
         assert!(last.0 < 2e-3, "{name}, refresh {refresh}: shape off by {}", last.0);
     }
 }
@@ -182,6 +186,6 @@ fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     assert!(off < 0.3 * size, "{felt:?} and {truth:?}");
     let view = pair.guests[1].session.body(BODY).unwrap();
     assert!(view.confirmed().unwrap().z.iter().any(|z| *z != 0.0));
-    assert_eq!(view.counts().mismatches, 0, "the checksum counts the flow");
+    assert_eq!(view.counts().mismatches, 0, "the checksum counts the viscoelastic state");
     assert!(pair.now() >= Duration::from_secs(20));
 }

@@ -3,6 +3,7 @@
 
 mod support;
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use pliant_lab::pair::{Pair, PathConfig, World};
@@ -10,10 +11,10 @@ use pliant_modal::{Body, BodyConfig};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::{
     BodyId, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
-    HostSessionConfig, PeerId, RecoveryConfig, StepSettings, UserId,
+    HostSessionConfig, PeerId, RecoveryConfig, Role, StepSettings, UserId,
 };
-use support::bar;
 use support::scene::{BODY, MS, S, Scene, cached, circling, paper1, start, start_with};
+use support::{bar, loose_bar};
 
 #[test]
 fn model_is_sent_in_pieces_to_those_who_lack_it_only() {
@@ -49,6 +50,64 @@ fn late_joiner_has_the_right_picture_within_a_second() {
     assert!(late.body(BODY).unwrap().is_ready());
     let error = scene.error(late) / scene.size();
     assert!(error < 1e-3, "{error}");
+}
+
+/// Two guests strike a free body over the paper's worst network, and a third one may only watch.
+/// The momentum is the sum of what was sent: each impulse acts once.
+#[test]
+fn impulses_of_guests_act_once_and_all_see_the_same() {
+    let model = loose_bar(20, 0.05);
+    let (mut pair, mut scene) = start_with(&model, HostSessionConfig { open: false, ..Default::default() });
+    let mut sent = BTreeSet::new();
+    scene.hand = Box::new(move |now, guest, session| {
+        // From second 3 to 9, twice a second: the first two in turns, and the third one each time.
+        let half = (now.as_secs_f64() * 2.0) as u64;
+        let turn = guest == 2 || half % 2 == guest as u64;
+        if turn && (6..18).contains(&half) && sent.insert((guest, half)) {
+            let impulse = [0.5, 0.25 + 0.5 * guest as f64, -0.125];
+            session.apply_impulse(now, BODY, 20 + 4 * guest as u32, impulse).unwrap();
+        }
+    });
+    for seed in 1..=3 {
+        pair.join_with(GuestSessionConfig::default(), paper1(), seed, cached(&model)).unwrap();
+    }
+    struct Door(Scene);
+    impl World for Door {
+        fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
+            self.0.step(now, tick, host);
+        }
+        fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
+            if let HostEvent::JoinRequest { peer, .. } = &event {
+                let role = if peer.0 == 3 { Role::Watch } else { Role::Hold };
+                host.accept_as(now, *peer, None, role).unwrap();
+            }
+            self.0.host_event(now, event, host);
+        }
+        fn guest_event(&mut self, now: Duration, guest: usize, event: GuestEvent, s: &mut GuestSession) {
+            self.0.guest_event(now, guest, event, s);
+        }
+        fn guest_stepped(&mut self, now: Duration, guest: usize, stepped: u64, s: &mut GuestSession) {
+            self.0.guest_stepped(now, guest, stepped, s);
+        }
+    }
+    let mut door = Door(scene);
+    pair.run_until(12 * S, &mut door);
+    let scene = &door.0;
+    let struck = scene.host_events.iter().filter(|e| matches!(e, HostEvent::Impulse { .. })).count();
+    assert_eq!(struck, 12, "six of each who may hold");
+    let momentum = scene.body.frame().velocity().map(|v| v * model.mass());
+    for (axis, expected) in [12.0 * 0.5, 6.0 * 0.25 + 6.0 * 0.75, -12.0 * 0.125].into_iter().enumerate() {
+        assert!((momentum[axis] - expected).abs() < 1e-9, "{momentum:?}, {expected} along {axis}");
+    }
+    for (guest, end) in pair.guests.iter().enumerate() {
+        let view = end.session.body(BODY).unwrap();
+        let (_, truth) = scene.poses.iter().find(|pose| pose.0 == view.tick()).unwrap();
+        let pose = view.pose().unwrap();
+        let far = (0..3).map(|k| (pose.position[k] - truth.position[k]).powi(2)).sum::<f64>().sqrt();
+        let error = scene.error(&end.session) / scene.size();
+        println!("guest {guest}: place off by {far:.1e} m, shape by {:.3} %", 100.0 * error);
+        assert!(far < 1e-3 && error < 0.01, "{guest}: {far} m, {error}");
+    }
 }
 
 #[test]

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, Elasticity, Integrator, ModalModel, Relaxation, StepSettings};
 use pliant_stream::emulator::LinkConfig;
+use pliant_stream::peer::PeerSessionConfig;
 use pliant_stream::{
     BodyId, GuestSessionConfig, HostSessionConfig, Newmark, PeerId, RecoveryConfig, RepairCounts, StreamError,
 };
@@ -64,12 +65,15 @@ pub struct Experiment {
     /// Clock for the time that decoding, correcting and stepping take. `None` leaves
     /// [`Metrics::cpu_us_per_tick`] at 0.
     pub cpu_clock: Option<fn() -> Duration>,
+    /// Earlier ticks that each datagram between peers repeats. Default: that of
+    /// [`PeerSessionConfig`].
+    pub peer_repeats: usize,
     /// The guest also holds the body, where the first hand does, and sends its target every tick.
     /// This measures the traffic from guest to host. The host does not act on the hand, so the
     /// errors are meaningless then. Default: false.
     pub guest_hand: bool,
-    /// Keep the visual and true position of the first hand's patch per tick, for plots. Default:
-    /// false.
+    /// Keep the visual and true displacement and reaction of the first hand per tick, for plots.
+    /// Default: false.
     pub keep_track: bool,
 }
 
@@ -115,9 +119,9 @@ impl HandScript {
 pub struct Metrics {
     /// Ticks that the guest showed.
     pub ticks: u64,
-    /// Ticks that the guest did not show in time, because its state stood still or skipped them. In
+    /// Ticks that were not shown in time, because the visual state stood still or skipped them. In
     /// the errors, each of these ticks compares the last visual state with the true state of that
-    /// tick. Always 0 between peers, which step on time by themselves.
+    /// tick, and the last visual reactions with the true ones.
     pub missing: u64,
     /// Frames that the path lost.
     pub lost: u64,
@@ -128,22 +132,31 @@ pub struct Metrics {
     /// Visual error, root mean square over all ticks (including missing ones) and compared
     /// vertices.
     pub rms_percent: f64,
+    /// Visual error, root mean square, as a share of the root mean square of the true displacement
+    /// over the same ticks and vertices. A slow or short motion does not make it look small.
+    pub rms_of_motion_percent: f64,
     /// Largest visual error.
     pub max_percent: f64,
     /// Visual error at the last tick, shown or missing.
     pub end_percent: f64,
     /// Error of the confirmed state at the last tick.
     pub confirmed_end_percent: f64,
-    /// Error of the visual reactions, root mean square.
+    /// Error of the visual reactions, root mean square. A reaction that is not shown counts as
+    /// zero.
     pub force_rms_percent: f64,
+    /// The same error as a share of the root mean square of the true reactions.
+    pub force_rms_of_force_percent: f64,
     /// Largest second difference of the visual reaction, as a share of the largest true reaction.
     pub force_ringing: f64,
     /// Largest second difference of the true reaction, as a share of the largest true reaction.
     pub true_ringing: f64,
-    /// Time from a hand's motion to the force that answers it, ms, computed and not timed. If the
-    /// policy owns the model, this is one tick by construction: the guest's own copy answers at its
-    /// next step (see [`pliant_stream::StreamedBody::predicted_hand`]). Otherwise it is half the
-    /// round trip, half a step and the mean visual delay.
+    /// Time from a hand's motion to the force that answers it, ms.
+    ///
+    /// Between peers it is measured: the longest time from a position of the second peer's own hand
+    /// to the first step whose force has that position or a newer one. Between host and guest it is
+    /// computed. If the policy owns the model, it is one tick by construction: the guest's own copy
+    /// answers at its next step (see [`pliant_stream::StreamedBody::predicted_hand`]). Otherwise it
+    /// is half the round trip, half a step and the mean visual delay.
     pub hand_to_force_ms: f64,
     /// Mean time from the host's step to the showing of its tick, ms.
     pub visual_delay_ms: f64,
@@ -170,9 +183,19 @@ pub struct Metrics {
     pub scale: f64,
     /// Largest true reaction, N.
     pub force_scale: f64,
-    /// Tick, true and visual displacement of the first hand's patch along its largest reach, m. See
-    /// [`Experiment::keep_track`].
-    pub track: Vec<(u64, f64, f64)>,
+    /// The first hand at each tick. See [`Experiment::keep_track`].
+    pub track: Vec<TrackPoint>,
+}
+
+/// The first hand at a tick, along the axis of its largest reach.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct TrackPoint {
+    /// The tick.
+    pub tick: u64,
+    /// True and visual displacement of the hand's patch, m.
+    pub displacement: [f64; 2],
+    /// True and visual reaction, N. A visual reaction that is not there is 0.
+    pub reaction: [f64; 2],
 }
 
 impl Experiment {
@@ -196,6 +219,7 @@ impl Experiment {
             warmup: Duration::from_secs(2),
             quantum: HostSessionConfig::default().quantum,
             cpu_clock: None,
+            peer_repeats: PeerSessionConfig::default().repeats,
             guest_hand: false,
             keep_track: false,
         }

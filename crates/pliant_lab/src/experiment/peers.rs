@@ -1,7 +1,7 @@
 //! Measures two peers: each has some of the scripted hands, and the metrics describe the second
 //! peer.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use pliant_modal::GrabConfig;
@@ -9,6 +9,7 @@ use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
+use super::run::force_error;
 use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, norm};
 
 /// Interval at which a peer's application updates its session.
@@ -16,28 +17,65 @@ const LOOK: Duration = Duration::from_millis(5);
 /// Time by which both peers have joined and hold the body.
 const SETTLED: Duration = Duration::from_secs(3);
 
+/// Reactions of the hands, N, with their users.
+type Reactions = Vec<(UserId, [f64; 3])>;
+
 struct PeerSample {
     at: Duration,
     q: Vec<f64>,
-    reactions: Vec<(UserId, [f64; 3])>,
+    reactions: Reactions,
+}
+
+/// What the peers agree on at each tick, once all inputs are known.
+#[derive(Default)]
+struct Agreed {
+    q: BTreeMap<Tick, Vec<f64>>,
+    reactions: BTreeMap<Tick, Reactions>,
+}
+
+/// What a session of two peers leaves to be compared.
+struct Session {
+    seen: BTreeMap<Tick, PeerSample>,
+    agreed: Agreed,
+    /// What the path from the first peer lost, and its hash.
+    lost: u64,
+    hash: u64,
+    /// Number and bytes of the datagrams that each peer sent.
+    sent: [(u64, u64); 2],
+    /// Processor time of the second peer.
+    spent: Duration,
+    /// Longest time from a position of the second peer's hand to a force that has it.
+    answered: Duration,
 }
 
 impl Experiment {
     /// Runs the experiment between two equal peers instead of host and guest.
     ///
     /// The first peer has the first hand, the second the others, and `up` and `down` are the path
-    /// between them. The true state is what both agree on once all inputs are known. The metrics
-    /// describe what the second peer showed before that. `recovery`, `modes`, `newmark` and
-    /// `resend_after` have no effect.
+    /// between them. The true state is what both agree on under rollback once all inputs are known.
+    /// Compensation is compared with it as well, because it leaves each peer with a state of its
+    /// own. The metrics describe what the second peer showed before that. `recovery`, `modes`,
+    /// `newmark` and `resend_after` have no effect.
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for settings out of range, and [`StreamError::Model`] when
     /// the body cannot be stepped.
     pub fn run_peers(&self, repair: LateInputRepair) -> Result<Metrics, StreamError> {
+        let session = self.between_peers(repair)?;
+        let exact = match repair {
+            LateInputRepair::Rollback => None,
+            LateInputRepair::Compensate => Some(self.between_peers(LateInputRepair::Rollback)?.agreed),
+        };
+        Ok(self.peer_metrics(&session, exact.as_ref().unwrap_or(&session.agreed)))
+    }
+
+    fn between_peers(&self, repair: LateInputRepair) -> Result<Session, StreamError> {
         let h = 1.0 / self.rate;
         let settings = self.settings();
         let peer = |number: u16| -> Result<PeerSession, StreamError> {
-            let config = PeerSessionConfig { user: UserId(number), step: h, repair, ..Default::default() };
+            let repeats = self.peer_repeats;
+            let config =
+                PeerSessionConfig { user: UserId(number), step: h, repair, repeats, ..Default::default() };
             let mut peer = PeerSession::new(config)?;
             peer.add_body(BODY, self.model.clone(), &settings)?;
             Ok(peer)
@@ -63,11 +101,12 @@ impl Experiment {
         };
         let mut grabs: Vec<Option<u16>> = vec![None; self.hands.len()];
         let mut seen: BTreeMap<Tick, PeerSample> = BTreeMap::new();
-        let mut truth: BTreeMap<Tick, Vec<f64>> = BTreeMap::new();
-        let mut reactions: BTreeMap<Tick, Vec<(UserId, [f64; 3])>> = BTreeMap::new();
+        let mut agreed = Agreed::default();
+        // The positions of the second peer's first hand that no force has answered yet.
+        let (mut unanswered, mut answered) = (VecDeque::<(Duration, [f64; 3])>::new(), Duration::ZERO);
         let mut now = Duration::ZERO;
         let until = SETTLED + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
-        let (mut spent, mut sent) = (Duration::ZERO, (0_u64, 0_u64));
+        let (mut spent, mut sent) = (Duration::ZERO, [(0_u64, 0_u64); 2]);
         while now < until {
             for k in 0..2 {
                 let other = 1 - k;
@@ -90,6 +129,9 @@ impl Experiment {
                         }
                         Some(grab) => peers[k].set_target(grab, target)?,
                     }
+                    if index == 1 && now >= SETTLED {
+                        unanswered.push_back((now, target));
+                    }
                 }
                 let stepped = peers[k].update(now);
                 if k == 1
@@ -104,6 +146,17 @@ impl Experiment {
                     && let Some(body) = peers[1].body(BODY)
                 {
                     let reactions = body.grabs().iter().map(|g| (g.key.user, g.reaction)).collect();
+                    let own = body.grabs().iter().find(|g| g.key.user == UserId(2));
+                    // Targets are in single precision between peers.
+                    let used = own.and_then(|g| {
+                        let same = |t: &[f64; 3]| (0..3).all(|x| (t[x] - g.target[x]).abs() < 1e-6);
+                        unanswered.iter().rposition(|(_, target)| same(target))
+                    });
+                    for (at, _) in unanswered.drain(..used.map_or(0, |last| last + 1)) {
+                        answered = answered.max(now - at);
+                    }
+                    // What is never answered has been waiting since then.
+                    answered = unanswered.front().map_or(answered, |(at, _)| answered.max(now - *at));
                     seen.insert(
                         peers[1].tick(),
                         PeerSample { at: now, q: body.visual().q.clone(), reactions },
@@ -111,70 +164,71 @@ impl Experiment {
                 }
                 while let Some(out) = peers[k].poll_output() {
                     let channel = usize::from(out.channel == Channel::Message);
-                    if k == 0 && channel == 0 && now >= SETTLED {
-                        sent = (sent.0 + 1, sent.1 + out.bytes.len() as u64);
+                    if channel == 0 && now >= SETTLED {
+                        sent[k] = (sent[k].0 + 1, sent[k].1 + out.bytes.len() as u64);
                     }
                     links[k][channel].send(now, out.bytes.to_vec(), out.bytes.len());
                 }
             }
             // The confirmed state of the first peer counts as the true state.
             let confirmed = peers[0].confirmed();
-            for tick in confirmed.saturating_sub(8)..=confirmed {
+            let next = agreed.q.keys().next_back().map_or(0, |last| last + 1);
+            for tick in next.min(confirmed.saturating_sub(8))..=confirmed {
                 if let Some(state) = peers[0].state_at(BODY, tick) {
-                    truth.insert(tick, state.q.clone());
+                    agreed.q.insert(tick, state.q.clone());
                     if let Some(r) = peers[0].reactions_at(BODY, tick) {
-                        reactions.insert(tick, r);
+                        agreed.reactions.insert(tick, r);
                     }
                 }
             }
             now += LOOK;
         }
-        Ok(self.peer_metrics(&seen, &truth, &reactions, &links[0][0], spent, sent))
+        let link = &links[0][0];
+        let (lost, hash) = (link.counts().lost, link.hash());
+        Ok(Session { seen, agreed, lost, sent, hash, spent, answered })
     }
 
-    fn peer_metrics(
-        &self,
-        seen: &BTreeMap<Tick, PeerSample>,
-        truth: &BTreeMap<Tick, Vec<f64>>,
-        reactions: &BTreeMap<Tick, Vec<(UserId, [f64; 3])>>,
-        link: &EmulatedLink,
-        spent: Duration,
-        sent: (u64, u64),
-    ) -> Metrics {
-        // The start of the grabs is not measured.
-        let first = seen.keys().next().copied().unwrap_or(0);
-        let truth: BTreeMap<Tick, &Vec<f64>> = truth.range(first..).map(|(t, q)| (*t, q)).collect();
-        let reactions: BTreeMap<Tick, &Vec<(UserId, [f64; 3])>> =
-            reactions.range(first..).map(|(t, r)| (*t, r)).collect();
+    fn peer_metrics(&self, session: &Session, agreed: &Agreed) -> Metrics {
+        let Session { seen, sent, .. } = session;
+        // The start of the grabs is not measured, nor is the end, on which nobody agrees yet.
+        let Some(first) = seen.keys().next().copied() else { return Metrics::default() };
+        let truth: Vec<(Tick, &Vec<f64>)> = agreed.q.range(first..).map(|(t, q)| (*t, q)).collect();
         let shape = ShapeError::new(&self.model);
-        let scale = truth.values().map(|q| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
-        let all = || reactions.values().copied().flatten().map(|r| norm(r.1));
-        let force_scale = all().fold(0.0, f64::max);
-        let mut f = Metrics { scale, force_scale, lost: link.counts().lost, ..Metrics::default() };
-        let (mut sum, mut largest, mut last) = (0.0, 0.0_f64, 0.0);
-        let (mut force, mut forces) = (0.0, 0_u64);
+        let scale = truth.iter().map(|(_, q)| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
+        let all = || agreed.reactions.range(first..).flat_map(|(_, r)| r);
+        let force_scale = all().map(|r| norm(r.1)).fold(0.0, f64::max);
+        let mut f = Metrics { scale, force_scale, lost: session.lost, ..Metrics::default() };
+        let (mut sum, mut motion, mut largest, mut last) = (0.0, 0.0, 0.0_f64, 0.0);
+        let (mut force, mut force_motion, mut forces) = (0.0, 0.0, 0_u64);
         let (mut above, mut longest) = (None, Duration::ZERO);
         let mut hash = 0xCBF2_9CE4_8422_2325;
-        for (tick, s) in seen {
-            let Some(q) = truth.get(tick) else { continue };
+        let mut picture = None;
+        for (tick, q) in truth {
+            // The picture of the last tick that was shown stands in the place of one that was not.
+            if let Some(shown) = seen.get(&tick) {
+                picture = Some(shown);
+                f.ticks += 1;
+                for q in &shown.q {
+                    hash = fold(hash, &q.to_bits().to_le_bytes());
+                }
+            } else {
+                f.missing += 1;
+            }
+            let Some(s) = picture else { continue };
             let (total, most) = shape.compare(&s.q, q);
             sum += total;
+            motion += shape.compare(q, &[]).0;
             largest = largest.max(most);
             last = most;
-            f.ticks += 1;
             if most.sqrt() > RECOVERED * scale {
                 let from: &mut Duration = above.get_or_insert(s.at);
                 longest = longest.max(s.at.saturating_sub(*from));
             } else {
                 above = None;
             }
-            for (user, real) in reactions.get(tick).copied().into_iter().flatten() {
-                let Some((_, shown)) = s.reactions.iter().find(|r| r.0 == *user) else { continue };
-                force += (0..3).map(|k| (shown[k] - real[k]).powi(2)).sum::<f64>();
-                forces += 1;
-            }
-            for q in &s.q {
-                hash = fold(hash, &q.to_bits().to_le_bytes());
+            if let Some(real) = agreed.reactions.get(&tick) {
+                let (error, size, count) = force_error(real, &s.reactions);
+                (force, force_motion, forces) = (force + error, force_motion + size, forces + count);
             }
         }
         let second = |series: Vec<[f64; 3]>| {
@@ -184,21 +238,26 @@ impl Experiment {
         };
         let of_first = |r: &[(UserId, [f64; 3])]| r.iter().find(|r| r.0 == UserId(1)).map(|r| r.1);
         let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
-        let ticks = f.ticks.max(1) as f64;
+        let ticks = (f.ticks + f.missing).max(1) as f64;
         f.rms_percent = percent((sum / ticks / shape.places()).sqrt(), scale);
+        f.rms_of_motion_percent = percent(sum.sqrt(), motion.sqrt());
         f.max_percent = percent(largest.sqrt(), scale);
         f.end_percent = percent(last.sqrt(), scale);
         f.force_rms_percent = percent((force / forces.max(1) as f64).sqrt(), force_scale);
+        f.force_rms_of_force_percent = percent(force.sqrt(), force_motion.sqrt());
         f.force_ringing =
             second(seen.values().filter_map(|s| of_first(&s.reactions)).collect()) / force_scale.max(1e-12);
-        f.true_ringing =
-            second(reactions.values().filter_map(|r| of_first(r)).collect()) / force_scale.max(1e-12);
-        f.hand_to_force_ms = 1e3 / self.rate;
+        f.true_ringing = second(agreed.reactions.range(first..).filter_map(|(_, r)| of_first(r)).collect())
+            / force_scale.max(1e-12);
+        f.hand_to_force_ms = session.answered.as_secs_f64() * 1e3;
         f.recover_ms = longest.as_secs_f64() * 1e3;
-        f.bytes_per_frame = sent.1 as f64 / sent.0.max(1) as f64;
-        f.kbit_s = sent.1 as f64 * 8e-3 / self.seconds;
-        f.cpu_us_per_tick = 1e6 * spent.as_secs_f64() / ticks;
-        f.hash = fold(hash, &link.hash().to_le_bytes());
+        let [down, up] = *sent;
+        f.bytes_per_frame = down.1 as f64 / down.0.max(1) as f64;
+        f.kbit_s = down.1 as f64 * 8e-3 / self.seconds;
+        f.bytes_per_datagram_up = up.1 as f64 / up.0.max(1) as f64;
+        f.kbit_s_up = up.1 as f64 * 8e-3 / self.seconds;
+        f.cpu_us_per_tick = 1e6 * session.spent.as_secs_f64() / f.ticks.max(1) as f64;
+        f.hash = fold(hash, &session.hash.to_le_bytes());
         f
     }
 }

@@ -9,7 +9,7 @@ use pliant_stream::{
     GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, RigidState, TickState, UserId,
 };
 
-use super::{BODY, Experiment, HandScript, Metrics, RECOVERED, ShapeError, fold, norm};
+use super::{BODY, Experiment, HandScript, Metrics, RECOVERED, ShapeError, TrackPoint, fold, norm};
 use crate::pair::World;
 
 /// True states kept for comparison, ticks.
@@ -27,6 +27,37 @@ struct Truth {
     reactions: Vec<(GrabKey, [f64; 3])>,
 }
 
+/// Squared error of the shown reactions, squared true reactions (N^2) and number of the true ones.
+/// A reaction that is not shown counts as zero, so that its error is the whole true reaction.
+pub(super) fn force_error<K: PartialEq>(truth: &[(K, [f64; 3])], shown: &[(K, [f64; 3])]) -> (f64, f64, u64) {
+    let (mut error, mut size) = (0.0, 0.0);
+    for (key, real) in truth {
+        let shown = shown.iter().find(|r| r.0 == *key).map_or([0.0; 3], |r| r.1);
+        error += (0..3).map(|k| (shown[k] - real[k]).powi(2)).sum::<f64>();
+        size += real.iter().map(|x| x * x).sum::<f64>();
+    }
+    (error, size, truth.len() as u64)
+}
+
+/// The entry of the track for a tick: the first hand, along one axis.
+fn track(
+    tick: u64,
+    row: &[f64],
+    axis: usize,
+    truth: &Truth,
+    shown: &[f64],
+    played: &[(GrabKey, [f64; 3])],
+) -> TrackPoint {
+    let dot = |q: &[f64]| q.iter().zip(row).map(|(q, r)| q * r).sum::<f64>();
+    let of_first =
+        |all: &[(GrabKey, [f64; 3])]| all.iter().find(|r| r.0.grab == 0).map_or(0.0, |r| r.1[axis]);
+    TrackPoint {
+        tick,
+        displacement: [dot(&truth.q), dot(shown)],
+        reaction: [of_first(&truth.reactions), of_first(played)],
+    }
+}
+
 /// The caller's side of the session: the true body, its hands and the comparison.
 pub(super) struct Run {
     body: Body,
@@ -34,15 +65,19 @@ pub(super) struct Run {
     hands: Vec<ExperimentGrab>,
     truth: VecDeque<Truth>,
     shape: ShapeError,
+    /// The axis of the tracks, and the row of the first hand's vertex along it.
+    track_axis: usize,
     track_row: Vec<f64>,
     keep_track: bool,
     /// The guest's hand, and its grab once it has begun.
     guest_hand: Option<(HandScript, Option<u16>)>,
     /// Time at which the guest last sent its target.
     guest_sent: Duration,
-    predict_own_hand: bool,
+    predict_hand: bool,
     measuring: Option<Duration>,
     sum: f64,
+    /// Sum of the squared true displacements of the compared ticks, m^2.
+    motion: f64,
     /// Ticks shown, and ticks shown or missed.
     count: u64,
     compared: u64,
@@ -51,7 +86,9 @@ pub(super) struct Run {
     last: f64,
     confirmed_last: f64,
     scale: f64,
+    /// Sums of the squared errors of the shown reactions and of the squared true ones, N^2.
     force_sum: f64,
+    force_motion: f64,
     force_count: u64,
     force_scale: f64,
     visual_force: Vec<([f64; 3], [f64; 3])>,
@@ -61,12 +98,14 @@ pub(super) struct Run {
     delay_sum: f64,
     above: Vec<(Duration, f64)>,
     hash: u64,
-    track: Vec<(u64, f64, f64)>,
+    track: Vec<TrackPoint>,
     last_tick: u64,
     /// Time of the last shown tick, and its coordinates. They stay visible until the next shown
     /// tick.
     displayed_at: Option<Duration>,
     picture: Vec<f64>,
+    /// The reactions that were shown with it. A device goes on playing them.
+    played: Vec<(GrabKey, [f64; 3])>,
     /// Ticks missed since then.
     stalled: u64,
     /// Number of consecutive ticks shown up to the last one.
@@ -78,9 +117,10 @@ impl Run {
         let model = &experiment.model;
         let modes = model.mode_count();
         let shape = ShapeError::new(model);
+        let reach = experiment.hands.first().map_or([0.0; 3], |hand| hand.reach);
+        let track_axis = (0..3).max_by(|a, b| reach[*a].total_cmp(&reach[*b])).unwrap_or(0);
         let track_row = experiment.hands.first().map_or(Vec::new(), |hand| {
-            let axis = (0..3).max_by(|a, b| hand.reach[*a].total_cmp(&hand.reach[*b])).unwrap_or(0);
-            (0..modes).map(|mode| f64::from(model.displacement_row(hand.vertex, axis, mode))).collect()
+            (0..modes).map(|mode| f64::from(model.displacement_row(hand.vertex, track_axis, mode))).collect()
         });
         Self {
             body,
@@ -88,13 +128,15 @@ impl Run {
             hands: experiment.hands.iter().map(|h| ExperimentGrab { hand: *h, grab: None }).collect(),
             truth: VecDeque::with_capacity(KEPT),
             shape,
+            track_axis,
             track_row,
             keep_track: experiment.keep_track,
             guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
             guest_sent: Duration::ZERO,
-            predict_own_hand: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
+            predict_hand: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
             measuring: None,
             sum: 0.0,
+            motion: 0.0,
             count: 0,
             compared: 0,
             missing: 0,
@@ -103,6 +145,7 @@ impl Run {
             confirmed_last: 0.0,
             scale: 0.0,
             force_sum: 0.0,
+            force_motion: 0.0,
             force_count: 0,
             force_scale: 0.0,
             visual_force: Vec::new(),
@@ -116,6 +159,7 @@ impl Run {
             last_tick: 0,
             displayed_at: None,
             picture: Vec::new(),
+            played: Vec::new(),
             stalled: 0,
             in_row: 0,
         }
@@ -171,22 +215,32 @@ impl Run {
     fn miss(&mut self, now: Duration, tick: u64) {
         let first = self.truth.front().map_or(u64::MAX, |truth| truth.tick);
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
-        // A guest with fewer modes is compared in those modes only. A guest without any state shows
-        // the body at rest.
-        let modes = if self.picture.is_empty() { truth.q.len() } else { self.picture.len() };
-        let (sum, largest) = self.shape.compare(&self.picture, &truth.q[..modes.min(truth.q.len())]);
+        // A guest without any state shows the body at rest. Modes that it does not have count as 0.
+        let (sum, largest) = self.shape.compare(&self.picture, &truth.q);
+        let motion = self.shape.compare(&truth.q, &[]).0;
+        let forces = force_error(&truth.reactions, &self.played);
         if self.keep_track {
-            let dot = |q: &[f64]| q.iter().zip(&self.track_row).map(|(q, r)| q * r).sum::<f64>();
-            let entry = (tick, dot(&truth.q), dot(&self.picture));
-            self.track.push(entry);
+            self.track.push(track(
+                tick,
+                &self.track_row,
+                self.track_axis,
+                truth,
+                &self.picture,
+                &self.played,
+            ));
         }
         self.missing += 1;
-        self.record(now, sum, largest);
+        self.record(now, sum, motion, largest, forces);
     }
 
-    /// Adds the squared errors of one tick, shown or missed.
-    fn record(&mut self, now: Duration, sum: f64, largest: f64) {
+    /// Adds the squared errors of one tick, shown or missed: of the shape, with the squared true
+    /// displacement, and of the reactions, see [`force_error`].
+    fn record(&mut self, now: Duration, sum: f64, motion: f64, largest: f64, forces: (f64, f64, u64)) {
+        self.force_sum += forces.0;
+        self.force_motion += forces.1;
+        self.force_count += forces.2;
         self.sum += sum;
+        self.motion += motion;
         self.compared += 1;
         self.largest = self.largest.max(largest);
         self.last = largest;
@@ -216,6 +270,7 @@ impl Run {
             guessed: counts.guessed,
             recovered: counts.repaired,
             rms_percent: percent((self.sum / compared / places).sqrt(), self.scale),
+            rms_of_motion_percent: percent(self.sum.sqrt(), self.motion.sqrt()),
             max_percent: percent(self.largest.sqrt(), self.scale),
             end_percent: percent(self.last.sqrt(), self.scale),
             confirmed_end_percent: percent(self.confirmed_last.sqrt(), self.scale),
@@ -223,10 +278,11 @@ impl Run {
                 (self.force_sum / self.force_count.max(1) as f64).sqrt(),
                 self.force_scale,
             ),
+            force_rms_of_force_percent: percent(self.force_sum.sqrt(), self.force_motion.sqrt()),
             force_ringing: ratio(self.visual_second, self.force_scale),
             true_ringing: ratio(self.true_second, self.force_scale),
             hand_to_force_ms: 1e3
-                * if self.predict_own_hand {
+                * if self.predict_hand {
                     // The guest's own copy of the body answers at its next tick.
                     self.h
                 } else {
@@ -353,17 +409,17 @@ impl World for Run {
         self.picture.clone_from(&shown.q);
         let Some(first) = self.truth.front().map(|t| t.tick) else { return };
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
-        let modes = shown.q.len();
-        let (sum, largest) = self.shape.compare(&shown.q, &truth.q[..modes]);
-        let (_, confirmed_largest) = self.shape.compare(&confirmed.q, &truth.q[..modes]);
+        let (sum, largest) = self.shape.compare(&shown.q, &truth.q);
+        let (_, confirmed_largest) = self.shape.compare(&confirmed.q, &truth.q);
+        let motion = self.shape.compare(&truth.q, &[]).0;
         let at = truth.at;
-        let (mut force, mut forces) = (0.0, 0);
+        self.played.clear();
+        self.played.extend(view.grabs().iter().map(|g| (g.key, g.reaction)));
+        let forces = force_error(&truth.reactions, &self.played);
         self.visual_force.resize(view.grabs().len().max(self.visual_force.len()), ([0.0; 3], [0.0; 3]));
         self.true_force.resize(self.visual_force.len(), ([0.0; 3], [0.0; 3]));
         for (i, g) in view.grabs().iter().enumerate() {
             let Some((_, reaction)) = truth.reactions.iter().find(|r| r.0 == g.key) else { continue };
-            force += (0..3).map(|k| (g.reaction[k] - reaction[k]).powi(2)).sum::<f64>();
-            forces += 1;
             for (series, new, second) in [
                 (&mut self.visual_force[i], g.reaction, &mut self.visual_second),
                 (&mut self.true_force[i], *reaction, &mut self.true_second),
@@ -376,16 +432,12 @@ impl World for Run {
             }
         }
         if self.keep_track {
-            let dot = |q: &[f64]| q.iter().zip(&self.track_row).map(|(q, r)| q * r).sum::<f64>();
-            let entry = (tick, dot(&truth.q), dot(&shown.q));
-            self.track.push(entry);
+            self.track.push(track(tick, &self.track_row, self.track_axis, truth, &shown.q, &self.played));
         }
-        self.force_sum += force;
-        self.force_count += forces;
         self.count += 1;
         self.confirmed_last = confirmed_largest;
         self.delay_sum += now.saturating_sub(at).as_secs_f64();
-        self.record(now, sum, largest);
+        self.record(now, sum, motion, largest, forces);
         for q in &shown.q {
             self.hash = fold(self.hash, &q.to_bits().to_le_bytes());
         }

@@ -1,8 +1,11 @@
 //! The report on the method's cost and errors, measured on this machine: tables, CSV, SVG, PNG and
 //! text.
 
+mod courses;
+mod elasticity;
 mod frames;
 mod front;
+mod networks;
 mod physics;
 mod plot;
 mod tables;
@@ -39,11 +42,13 @@ pub enum Part {
     Network,
     /// All settings together, for choosing one.
     Front,
+    /// Linear and reduced elasticity, by error and run time.
+    Elasticity,
     /// The paper's table 2.
     Table2,
     /// The paper's networks and the data sent over them.
     Table3,
-    /// The paper's figures 7 to 9.
+    /// The paper's figures 6 to 9.
     Courses,
     /// The default at run time, in words.
     Default,
@@ -51,7 +56,7 @@ pub enum Part {
 
 impl Part {
     /// All parts, in the order of the report.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Elements,
         Self::Modes,
         Self::Steps,
@@ -60,6 +65,7 @@ impl Part {
         Self::Frames,
         Self::Network,
         Self::Front,
+        Self::Elasticity,
         Self::Table2,
         Self::Table3,
         Self::Courses,
@@ -77,6 +83,7 @@ impl Part {
             Self::Frames => "frames",
             Self::Network => "network",
             Self::Front => "front",
+            Self::Elasticity => "elasticity",
             Self::Table2 => "table-2",
             Self::Table3 => "table-3",
             Self::Courses => "courses",
@@ -99,9 +106,10 @@ impl Part {
             Self::Frames => "e. Quantized frames",
             Self::Network => "f. Network",
             Self::Front => "g. All together",
+            Self::Elasticity => "h. Elasticity",
             Self::Table2 => "The paper's table 2",
             Self::Table3 => "The paper's networks and what crosses them (its table 3)",
-            Self::Courses => "The paper's figures 7, 8 and 9",
+            Self::Courses => "The paper's figures 6, 7, 8 and 9",
             Self::Default => "The default at run time, in words",
         }
     }
@@ -200,11 +208,12 @@ fn measure(
         Part::Warp => (warp::warp(quick)?, String::new()),
         Part::Precision => (vec![tables::precision()?], String::new()),
         Part::Frames => (vec![frames::quantized(quick, progress)?], String::new()),
-        Part::Network => tables::networks(quick, progress)?,
+        Part::Network => networks::networks(quick, progress)?,
         Part::Front => front::all_together(quick, progress)?,
+        Part::Elasticity => elasticity::elasticity(quick)?,
         Part::Table2 => (Vec::new(), tables::table_2(models, own, if quick { 0.3 } else { 2.0 }, progress)?),
         Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
-        Part::Courses => (tables::courses()?, String::new()),
+        Part::Courses => (courses::courses()?, String::new()),
         Part::Default => {
             let tets = if quick { [12_000, 2_000] } else { [50_000, 12_000] };
             (Vec::new(), tables::default_setting(models, own, tets, progress)?)

@@ -60,7 +60,7 @@ pub(super) struct Figure {
 const SIZE: (u32, u32) = (860, 520);
 
 fn color(index: usize) -> RGBColor {
-    const COLORS: [RGBColor; 8] = [
+    const COLORS: [RGBColor; 9] = [
         RGBColor(27, 158, 119),
         RGBColor(217, 95, 2),
         RGBColor(117, 112, 179),
@@ -69,6 +69,7 @@ fn color(index: usize) -> RGBColor {
         RGBColor(166, 118, 29),
         RGBColor(31, 120, 180),
         RGBColor(90, 90, 90),
+        RGBColor(0, 0, 0),
     ];
     COLORS[index % COLORS.len()]
 }
@@ -176,7 +177,7 @@ fn draw<B: DrawingBackend>(
             }
             chart
                 .configure_series_labels()
-                .position(SeriesLabelPosition::UpperRight)
+                .position(freest(all(), &xs, &ys, figure.logarithmic))
                 .background_style(WHITE.mix(0.8))
                 .border_style(RGBColor(200, 200, 200))
                 .label_font(("sans-serif", 14))
@@ -191,8 +192,33 @@ fn draw<B: DrawingBackend>(
     area.present()
 }
 
+/// The corner with the fewest points, where the legend covers the least.
+fn freest(
+    points: impl Iterator<Item = (f64, f64)>,
+    xs: &std::ops::Range<f64>,
+    ys: &std::ops::Range<f64>,
+    logarithmic: bool,
+) -> SeriesLabelPosition {
+    use SeriesLabelPosition::{LowerLeft, LowerRight, UpperLeft, UpperRight};
+    let share = |v: f64, range: &std::ops::Range<f64>| {
+        let at = |v: f64| if logarithmic { v.ln() } else { v };
+        (at(v) - at(range.start)) / (at(range.end) - at(range.start))
+    };
+    let mut counts = [0usize; 4];
+    for (x, y) in points {
+        let (x, y) = (share(x, xs), share(y, ys));
+        let corners = [(x > 0.5, y > 0.55), (x < 0.5, y > 0.55), (x < 0.5, y < 0.45), (x > 0.5, y < 0.45)];
+        for (count, (beside, level)) in counts.iter_mut().zip(corners) {
+            *count += usize::from(beside && level);
+        }
+    }
+    let all = counts.into_iter().zip([UpperRight, UpperLeft, LowerLeft, LowerRight]);
+    all.min_by_key(|(count, _)| *count).map_or(UpperRight, |(_, corner)| corner)
+}
+
 fn label(v: f64) -> String {
-    if v == 0.0 || (1e-2..1e4).contains(&v.abs()) {
+    // What is left of a subtraction is the zero of its axis.
+    if v.abs() < 1e-12 || (1e-2..1e4).contains(&v.abs()) {
         format!("{v:.4}").trim_end_matches('0').trim_end_matches('.').to_owned()
     } else {
         format!("{v:.0e}")

@@ -372,6 +372,21 @@ impl Mesh {
                 }
                 PeerEvent::Joined { user, .. } => {
                     self.nodes[process].missed.remove(&process_of(user));
+                    let others: Vec<(UserId, String)> = (0..self.nodes.len())
+                        .filter(|other| *other != process && self.is_there(process, *other))
+                        .map(|other| (number(other), String::new()))
+                        .collect();
+                    let Some(session) = &mut self.nodes[process].session else { continue };
+                    let told = session.introduce(&others);
+                    self.ensure(told.is_ok(), || format!("process {process} tells nobody: {told:?}"));
+                }
+                PeerEvent::Introduced { others, .. } => {
+                    // A liar may tell of anybody.
+                    let real = others.into_iter().map(|(user, _)| process_of(user));
+                    for other in real.filter(|other| *other < process) {
+                        let at = self.now;
+                        self.nodes[process].missed.entry(other).or_insert(at);
+                    }
                 }
                 PeerEvent::Left { user, reason } => {
                     let other = process_of(user);

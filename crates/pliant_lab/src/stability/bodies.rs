@@ -88,18 +88,22 @@ impl BarBody {
     /// The surface vertex nearest to a position in shares of the bar's edges.
     pub(super) fn vertex(&self, model: &ModalModel, share: [f64; 3]) -> u32 {
         let size = self.size();
-        let at: [f64; 3] = std::array::from_fn(|k| share[k] * size[k]);
-        let away = |p: &[f32; 3]| (0..3).map(|k| (f64::from(p[k]) - at[k]).powi(2)).sum::<f64>();
-        let positions = model.surface().positions();
-        (0..positions.len() as u32)
-            .min_by(|a, b| away(&positions[*a as usize]).total_cmp(&away(&positions[*b as usize])))
-            .unwrap_or(0)
+        nearest_vertex(model, std::array::from_fn(|k| share[k] * size[k]))
     }
 
     /// The patch in the middle of the free end.
     pub(super) fn tip(&self, model: &ModalModel) -> Result<Patch, LabError> {
         Ok(Patch::around(model.surface(), self.vertex(model, [1.0, 0.5, 0.5]), 0.12 * self.length)?)
     }
+}
+
+/// The surface vertex nearest to a place, m.
+pub(super) fn nearest_vertex(model: &ModalModel, at: [f64; 3]) -> u32 {
+    let away = |p: &[f32; 3]| (0..3).map(|k| (f64::from(p[k]) - at[k]).powi(2)).sum::<f64>();
+    let positions = model.surface().positions();
+    (0..positions.len() as u32)
+        .min_by(|a, b| away(&positions[*a as usize]).total_cmp(&away(&positions[*b as usize])))
+        .unwrap_or(0)
 }
 
 /// A held body with a hand on its tip.
@@ -203,6 +207,13 @@ pub(super) fn energy_growth(body: &mut Body, steps: usize) -> Result<[f64; 2], S
 /// another norm, which equals the energy within a factor.
 pub(super) fn no_growth(growth: f64) -> Bound {
     Bound::new("largest growth of the energy in a step / energy", growth, 1e-9)
+}
+
+/// The bound on a largest energy as a multiple of the first one, which leaves room for rounding
+/// only.
+pub(super) fn gain(what: &'static str, multiple: f64) -> Bound {
+    // A number that is not finite stays so.
+    Bound::new(what, if multiple <= 1.0 { 0.0 } else { multiple - 1.0 }, 1e-9)
 }
 
 /// A state from coordinates and velocities, with the matching accelerations.

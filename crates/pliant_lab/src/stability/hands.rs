@@ -6,7 +6,7 @@ use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch, Step
 
 use super::{
     Bound, Case, CaseOutcome,
-    bodies::{BarBody, HeldCase, compliance, modal_compliance, settling},
+    bodies::{BarBody, HeldCase, compliance, gain, modal_compliance, settling},
     plain,
 };
 use crate::LabError;
@@ -78,7 +78,8 @@ pub(super) fn cases(out: &mut Vec<Case>) {
                 drift = drift.max((held.reaction()? - settled).norm() / settled.norm());
             }
         }
-        Ok(CaseOutcome::of(vec![Bound::new("drift of the reaction / reaction", drift, 1e-9)]))
+        Ok(CaseOutcome::of(vec![Bound::new("drift of the reaction / reaction", drift, 1e-9)])
+            .stepped(&held.body))
     }));
     out.push(Case::new("a million steps", "dragged to and fro".into(), || {
         let bar = BarBody { modes: 6, zeta: 0.1, ..BarBody::default() };
@@ -95,7 +96,8 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             "largest reaction of the second half / of the first",
             peaks[1] / peaks[0],
             1.01,
-        )]))
+        )])
+        .stepped(&held.body))
     }));
     for density in [1.0, 1e6] {
         for stiffness in [None, Some(500.0)] {
@@ -132,13 +134,12 @@ fn teleport(young: f64, step: f64) -> Result<CaseOutcome, LabError> {
         held.body.step()?;
     }
     let plain = plain::beside(&held.model, step, &[held.patch], 400, |i| vec![away(i)])?;
-    Ok(CaseOutcome {
-        bounds: vec![
-            Bound::new("largest reaction / what the compliance allows", force / allowed, 1.0 + 1e-9),
-            Bound::new("energy left when let go / largest", held.body.energy() / energy, 1e-6),
-        ],
-        plain: Some(plain),
-    })
+    Ok(CaseOutcome::of(vec![
+        gain("largest reaction / what the compliance allows - 1", force / allowed),
+        Bound::new("energy left when let go / largest", held.body.energy() / energy, 1e-6),
+    ])
+    .beside(plain)
+    .stepped(&held.body))
 }
 
 /// Flips the target each step by the resolution of a cheap encoder.
@@ -161,13 +162,12 @@ fn jitter(young: f64, step: f64) -> Result<CaseOutcome, LabError> {
     // The patch itself may be as far away as the target, on the other side.
     let allowed = 2.0 * size * std::f64::consts::SQRT_2 / softest;
     let plain = plain::beside(&held.model, step, &[held.patch], 10_000, |i| vec![away(i)])?;
-    Ok(CaseOutcome {
-        bounds: vec![
-            Bound::new("largest reaction / twice the jitter over the compliance", peaks[0] / allowed, 1.0),
-            Bound::new("largest reaction of the second half / of the first", peaks[1] / peaks[0], 1.01),
-        ],
-        plain: Some(plain),
-    })
+    Ok(CaseOutcome::of(vec![
+        Bound::new("largest reaction / twice the jitter over the compliance", peaks[0] / allowed, 1.0),
+        Bound::new("largest reaction of the second half / of the first", peaks[1] / peaks[0], 1.01),
+    ])
+    .beside(plain)
+    .stepped(&held.body))
 }
 
 /// Four hands on the corners of the end turn it about the axis by two full turns, hold it and
@@ -220,14 +220,13 @@ fn twist(young: f64, corrections: u8) -> Result<CaseOutcome, LabError> {
     let plain = plain::beside(&model, 1.0 / 60.0, &patches, 900, |i| {
         starts.iter().map(|s| (turned(s, i) - s).into()).collect()
     })?;
-    Ok(CaseOutcome {
-        bounds: vec![
-            Bound::new("farthest a corner goes / size", farthest / model.size(), 1.0),
-            Bound::new("change of a held reaction in a step / reaction", held, 0.1),
-            Bound::new("energy left when let go / largest", body.energy() / energy, 1e-6),
-        ],
-        plain: Some(plain),
-    })
+    Ok(CaseOutcome::of(vec![
+        Bound::new("farthest a corner goes / size", farthest / model.size(), 1.0),
+        Bound::new("change of a held reaction in a step / reaction", held, 0.1),
+        Bound::new("energy left when let go / largest", body.energy() / energy, 1e-6),
+    ])
+    .beside(plain)
+    .stepped(&body))
 }
 
 /// Two hands on opposite sides of the end pull apart by a tenth of the length.
@@ -257,10 +256,9 @@ fn opposed(young: f64, stiffness: Option<f64>) -> Result<CaseOutcome, LabError> 
     }
     let plain =
         plain::beside(&model, 1.0 / 60.0, &patches, 600, |_| vec![[0.0, -0.1, 0.0], [0.0, 0.1, 0.0]])?;
-    Ok(CaseOutcome {
-        bounds: vec![Bound::new("unrest of the reaction / reaction", off, 0.01)],
-        plain: stiffness.is_none().then_some(plain),
-    })
+    let outcome = CaseOutcome::of(vec![Bound::new("unrest of the reaction / reaction", off, 0.01)]);
+    let outcome = outcome.stepped(&body);
+    Ok(if stiffness.is_none() { outcome.beside(plain) } else { outcome })
 }
 
 /// Hands on one patch must share the force that a single hand with their joint compliance gets.
@@ -288,14 +286,13 @@ fn coincident(hands: usize) -> Result<CaseOutcome, LabError> {
     let want = whole.try_inverse().map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * away);
     let patches = vec![patch; hands];
     let plain = plain::beside(&model, 1.0 / 60.0, &patches, 600, |_| vec![away.into(); hands])?;
-    Ok(CaseOutcome {
-        bounds: vec![Bound::new(
-            "|sum of reactions - static| / static",
-            (sum - want).norm() / want.norm(),
-            2e-3,
-        )],
-        plain: Some(plain),
-    })
+    Ok(CaseOutcome::of(vec![Bound::new(
+        "|sum of reactions - static| / static",
+        (sum - want).norm() / want.norm(),
+        2e-3,
+    )])
+    .beside(plain)
+    .stepped(&body))
 }
 
 /// A hand on an anchor must get the force of its own contact compliance and nothing else.
@@ -321,14 +318,13 @@ fn on_anchor(young: f64, beside: bool) -> Result<CaseOutcome, LabError> {
         .map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * away);
     let got = -Vector3::from(body.reaction(grab)?);
     let plain = plain::beside(&model, 1.0 / 60.0, &[patch], 10, |_| vec![away.into()])?;
-    Ok(CaseOutcome {
-        bounds: vec![Bound::new(
-            "|reaction - contact's| / contact's",
-            (got - want).norm() / want.norm(),
-            1e-6,
-        )],
-        plain: Some(plain),
-    })
+    Ok(CaseOutcome::of(vec![Bound::new(
+        "|reaction - contact's| / contact's",
+        (got - want).norm() / want.norm(),
+        1e-6,
+    )])
+    .beside(plain)
+    .stepped(&body))
 }
 
 fn spread(bar: &BarBody, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, LabError> {
@@ -372,10 +368,9 @@ fn many(modes: usize, hands: usize) -> Result<CaseOutcome, LabError> {
         }
     }
     let plain = plain::beside(&model, 1.0 / 60.0, &patches, 600, |_| (0..hands).map(away).collect())?;
-    Ok(CaseOutcome {
-        bounds: vec![Bound::new("unrest of the reactions / largest", off, 1e-3)],
-        plain: Some(plain),
-    })
+    Ok(CaseOutcome::of(vec![Bound::new("unrest of the reactions / largest", off, 1e-3)])
+        .beside(plain)
+        .stepped(&body))
 }
 
 /// Pulls a free body to and fro. The cases have masses a million times apart under the same hand.
@@ -398,5 +393,6 @@ fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<CaseOutcome, 
     Ok(CaseOutcome::of(vec![
         Bound::new("largest reaction of the second half / of the first", peaks[1] / peaks[0], 1.5),
         Bound::new("farthest from the hand / m", farthest, 10.0),
-    ]))
+    ])
+    .stepped(&held.body))
 }

@@ -172,13 +172,12 @@ fn drag(bar: &BarBody, config: BodyConfig) -> Result<CaseOutcome, LabError> {
         farthest = farthest.max(at.norm());
     }
     let bound = if held.model.omega()[0] * step > 0.05 { 0.1 } else { 0.5 };
-    Ok(CaseOutcome {
-        bounds: vec![
-            Bound::new("ringing of the reaction (4: a flip each step)", ringing(&forces), bound),
-            Bound::new("farthest the patch goes / the drag", farthest / reach, EXCURSION),
-        ],
-        plain: Some(plain::beside(&held.model, step, &[held.patch], steps, |i| vec![away(i)])?),
-    })
+    Ok(CaseOutcome::of(vec![
+        Bound::new("ringing of the reaction (4: a flip each step)", ringing(&forces), bound),
+        Bound::new("farthest the patch goes / the drag", farthest / reach, EXCURSION),
+    ])
+    .beside(plain::beside(&held.model, step, &[held.patch], steps, |i| vec![away(i)])?)
+    .stepped(&held.body))
 }
 
 /// Holds the tip a millionth of the length away until the body is at rest. The reaction must equal
@@ -209,7 +208,8 @@ fn hold_patch(bar: &BarBody, mut held: HeldCase) -> Result<CaseOutcome, LabError
         "|reaction - static| / static",
         (got - want).norm() / want.norm(),
         2e-3,
-    )]))
+    )])
+    .stepped(&held.body))
 }
 
 /// Applies an impulse at the tip and runs 5,000 free steps. The energy must never grow.
@@ -236,10 +236,11 @@ fn struck(bar: &BarBody, step: f64, integrator: Integrator) -> Result<CaseOutcom
             body.step()?;
             most = most.max(body.energy() / start);
         }
-        return Ok(CaseOutcome::of(vec![Bound::new("largest energy / energy at the start", most, 1.5)]));
+        return Ok(CaseOutcome::of(vec![Bound::new("largest energy / energy at the start", most, 1.5)])
+            .stepped(&body));
     }
     let [growth, _] = energy_growth(&mut body, 5_000)?;
-    Ok(CaseOutcome::of(vec![no_growth(growth)]))
+    Ok(CaseOutcome::of(vec![no_growth(growth)]).stepped(&body))
 }
 
 /// Moves nodes inside the bar toward the opposite face of a tetrahedron, so that only `1 - share`

@@ -5,7 +5,9 @@ use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, Relaxation, 
 
 use super::{
     Bound, Case, CaseOutcome, Expected,
-    bodies::{BarBody, Dice, HeldCase, energy_growth, nearest, no_growth, settling, state, static_pull},
+    bodies::{
+        BarBody, Dice, HeldCase, energy_growth, gain, nearest, no_growth, settling, state, static_pull,
+    },
     material::word,
 };
 use crate::LabError;
@@ -106,7 +108,7 @@ fn random(seed: u64, integrator: Integrator) -> Result<CaseOutcome, LabError> {
     let v = (0..modes).map(|i| dice.roll() * speed * body.model().omega()[i]).collect();
     body.set_state(&state(&body, q, v))?;
     let [growth, _] = energy_growth(&mut body, 10_000)?;
-    Ok(CaseOutcome::of(vec![no_growth(growth)]))
+    Ok(CaseOutcome::of(vec![no_growth(growth)]).stepped(&body))
 }
 
 /// Starts with the surface's points multiplied by `scale` about the middle of the held end, as
@@ -138,9 +140,10 @@ fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<CaseOut
         last = [last[0].min(kinetic), last[1].max(kinetic)];
     }
     Ok(CaseOutcome::of(vec![
-        Bound::new("largest energy / energy at the start", most, 1.0 + 1e-9),
+        gain("largest energy / energy at the start - 1", most),
         Bound::new("kinetic energy at the end / energy at the start", last[1] / start, 1e-6),
-    ]))
+    ])
+    .stepped(&body))
 }
 
 fn free(young: f64) -> BarBody {
@@ -167,7 +170,8 @@ fn flight(step: f64) -> Result<CaseOutcome, LabError> {
         // Angular momentum is taken about the world's origin. The body is up to a thousand lengths
         // away by then, and rounding errors grow with the distance.
         Bound::new("angular momentum lost / momentum", (l1 - l0).norm() / l0.norm(), 1e-6),
-    ]))
+    ])
+    .stepped(&body))
 }
 
 /// A tumble about an axis that is no principal axis, for 100,000 steps, must keep energy and
@@ -193,7 +197,8 @@ fn spinning(turns: f64, step: f64) -> Result<CaseOutcome, LabError> {
     Ok(CaseOutcome::of(vec![
         Bound::new("largest gain of the spin's energy / energy", gained, 1e-8),
         Bound::new("angular momentum lost / momentum", lost, 1e-9),
-    ]))
+    ])
+    .stepped(&body))
 }
 
 /// The change of momentum must equal the impulse of the two hands.
@@ -224,7 +229,8 @@ fn counted(step: f64) -> Result<CaseOutcome, LabError> {
     Ok(CaseOutcome::of(vec![
         Bound::new("|momentum's change - hands' pulls| / pulls", worst, 1e-6),
         Bound::new("farthest from the hands / m", largest, 10.0),
-    ]))
+    ])
+    .stepped(&body))
 }
 
 fn relaxing_energy(relaxation: Relaxation) -> Result<CaseOutcome, LabError> {
@@ -237,7 +243,7 @@ fn relaxing_energy(relaxation: Relaxation) -> Result<CaseOutcome, LabError> {
     let impulse = 0.05 * model.omega()[0] * model.mass();
     body.apply_impulse(bar.vertex(&model, [1.0, 0.5, 0.5]), [0.3 * impulse, impulse, -0.7 * impulse])?;
     let [growth, _] = energy_growth(&mut body, 5_000)?;
-    Ok(CaseOutcome::of(vec![no_growth(growth)]))
+    Ok(CaseOutcome::of(vec![no_growth(growth)]).stepped(&body))
 }
 
 /// After a long hold, `1 - ratio` of the reaction must be left.
@@ -258,5 +264,6 @@ fn relaxed_reaction(relaxation: Relaxation) -> Result<CaseOutcome, LabError> {
         "|reaction - relaxed| / relaxed",
         (got - want).norm() / want.norm(),
         5e-3,
-    )]))
+    )])
+    .stepped(&held.body))
 }

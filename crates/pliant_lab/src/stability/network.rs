@@ -80,19 +80,17 @@ fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<CaseOutcome
     let ours = made.run()?;
     let paper = experiment(link, rate, RecoveryConfig::paper())?.run()?;
     let bare = experiment(link, rate, RecoveryConfig::none())?.run()?;
-    Ok(CaseOutcome {
-        bounds: vec![
-            Bound::new(RMS, ours.rms_percent, rms),
-            Bound::new(LARGEST, ours.max_percent, max),
-            // Counts the ticks that were not shown in time, or all ticks if nothing was shown at
-            // all. Two may fall on the edges of the measured time.
-            Bound::new(TICKS, missing(&ours, ticks), (MISSING * ticks).max(2.0)),
-            // The reaction must be about as smooth as without loss, or within the bound of every
-            // dragged body here.
-            Bound::new("ringing of the reaction", ours.force_ringing, (1.2 * ours.true_ringing).max(0.1)),
-        ],
-        plain: Some(format!("{}; without repair {}", words(&paper), words(&bare))),
-    })
+    Ok(CaseOutcome::of(vec![
+        Bound::new(RMS, ours.rms_percent, rms),
+        Bound::new(LARGEST, ours.max_percent, max),
+        // Counts the ticks that were not shown in time, or all ticks if nothing was shown at all.
+        // Two may fall on the edges of the measured time.
+        Bound::new(TICKS, missing(&ours, ticks), (MISSING * ticks).max(2.0)),
+        // The reaction must be about as smooth as without loss, or within the bound of every
+        // dragged body here.
+        Bound::new("ringing of the reaction", ours.force_ringing, (1.2 * ours.true_ringing).max(0.1)),
+    ])
+    .beside(format!("{}; without repair {}", words(&paper), words(&bare))))
 }
 
 /// Number of ticks that were shown late or never.

@@ -7,7 +7,7 @@ use pliant_modal::{
 
 use super::{
     Bound, Case, CaseOutcome,
-    bodies::{BarBody, nearest, ringing, settling, state},
+    bodies::{BarBody, gain, nearest, ringing, settling, state},
 };
 use crate::LabError;
 
@@ -121,8 +121,9 @@ fn jerked(
     }
     Ok(CaseOutcome::of(vec![
         Bound::new("second difference of the force / force", ringing, 0.1),
-        Bound::new("largest energy / energy at the release", most, 1.0 + 1e-9),
-    ]))
+        gain("largest energy / energy at the release - 1", most),
+    ])
+    .stepped(&body))
 }
 
 /// Starts from a scaled shape and lets go.
@@ -141,7 +142,8 @@ fn started(shape: [f64; 3], step: f64) -> Result<CaseOutcome, LabError> {
         most = most.max(body.energy() / start);
     }
     Ok(CaseOutcome::of(vec![
-        Bound::new("largest energy / energy at the start", most, 1.0 + 1e-9),
+        gain("largest energy / energy at the start - 1", most),
         Bound::new("energy at the end / energy at the start", body.energy() / start, 0.1),
-    ]))
+    ])
+    .stepped(&body))
 }

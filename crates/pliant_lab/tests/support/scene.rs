@@ -118,6 +118,9 @@ impl World for Scene {
                     self.body.set_target(g.1, *target).unwrap();
                 }
             }
+            HostEvent::Impulse { vertex, impulse, .. } => {
+                self.body.apply_impulse(*vertex, *impulse).unwrap();
+            }
             HostEvent::GrabEnded { key, .. } => {
                 self.grabs.retain(|g| {
                     if g.0 == *key {

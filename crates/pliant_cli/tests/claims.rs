@@ -1,0 +1,311 @@
+//! The figures that README and book tell are those of the report's files and of the tables that
+//! programs wrote. A page that rounds must round right.
+
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
+
+use std::path::Path;
+
+/// A page with its lines joined, so that a sentence may be found.
+fn page(name: &str) -> String {
+    let text = read(name);
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn read(name: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").join(name);
+    std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The points of one line of a figure of the report.
+fn line(figure: &str, name: &str) -> Vec<(f64, f64)> {
+    let csv = read(&format!("docs/report/{figure}.csv"));
+    let start = format!("\"{name}\",");
+    let points: Vec<(f64, f64)> = csv
+        .lines()
+        .filter_map(|row| {
+            let mut numbers = row.strip_prefix(&start)?.split(',').map(|cell| cell.parse().unwrap());
+            Some((numbers.next()?, numbers.next()?))
+        })
+        .collect();
+    assert!(!points.is_empty(), "{name} in {figure}");
+    points
+}
+
+/// The cells of the first row of a page that begins with `start`.
+fn row(name: &str, start: &str) -> Vec<String> {
+    let text = read(name);
+    let row = text.lines().find(|line| line.starts_with(start));
+    let row = row.unwrap_or_else(|| panic!("no row {start} in {name}"));
+    row.trim_matches('|').split('|').map(|cell| cell.trim().to_owned()).collect()
+}
+
+/// The first number of a text and the worth of its last digit. Thousands may have commas.
+fn number(text: &str) -> (f64, f64) {
+    let from = text.find(|c: char| c.is_ascii_digit()).unwrap_or_else(|| panic!("no number in {text}"));
+    let number: String =
+        text[from..].chars().take_while(|c| c.is_ascii_digit() || ".,e-".contains(*c)).collect();
+    let number = number.trim_end_matches(['.', ',', '-', 'e']).replace(',', "");
+    let (digits, power) = number.split_once('e').unwrap_or((&number, "0"));
+    let scale = 10f64.powi(power.parse().unwrap());
+    let decimals = digits.split_once('.').map_or(0, |(_, after)| after.len());
+    (digits.parse::<f64>().unwrap() * scale, 10f64.powi(-(decimals as i32)) * scale)
+}
+
+/// A page says `before NUMBER`, and the number must be `real`, rounded to its last digit.
+fn says(name: &str, before: &str, real: f64) {
+    let text = page(name);
+    let (_, after) = text.split_once(before).unwrap_or_else(|| panic!("{name} does not say: {before}"));
+    let (told, digit) = number(after);
+    assert!((told - real).abs() <= 0.5001 * digit, "{name}: {before} {told}, but it is {real}");
+}
+
+const MEASUREMENTS: &str = "docs/measurements.md";
+const DECISIONS: &str = "docs/decisions.md";
+const LIMITS: &str = "docs/limits.md";
+const REPORT: &str = "docs/report/report.md";
+
+#[test]
+fn the_elements_and_modes_are_those_of_the_report() {
+    let (four, ten) = (line("a-elements", "tet4"), line("a-elements", "tet10"));
+    let within = ten.iter().find(|p| p.1 < 0.01).unwrap();
+    says(DECISIONS, "ten-node tetrahedra take", within.0);
+    says(DECISIONS, "four-node ones are off by", 100.0 * four.last().unwrap().1);
+    says(DECISIONS, "four-node ones are off by 4 % after", four.last().unwrap().0);
+    let [with, without] =
+        ["with residual flexibility (default)", "without"].map(|name| line("b-modes", name));
+    says(DECISIONS, "residual flexibility give the hand a force within", 100.0 * with[2].1);
+    says(DECISIONS, "Without it the error is", 100.0 * without[2].1);
+    says(DECISIONS, "and with 128 modes still", 100.0 * without.last().unwrap().1);
+}
+
+#[test]
+fn the_integrators_are_those_of_the_report() {
+    let free = |name| 100.0 * line("c-steps-free", name)[0].1;
+    let [newmark, alpha] = ["Newmark (the paper's)", "generalized-alpha 0.5"].map(free);
+    says(DECISIONS, "A struck bar is off by rounding at 60 Hz, and by", newmark);
+    says(DECISIONS, "A struck bar is off by rounding at 60 Hz, and by", alpha);
+    let exact = line("c-steps-held", "exact (default)");
+    let mut before = "With `StepSettings::second_order` it is".to_owned();
+    for (point, told) in exact.iter().zip(["0.41", "0.12", "0.046"]) {
+        says(MEASUREMENTS, &before, 100.0 * point.1);
+        before = format!("{before} {told} /");
+    }
+    says(MEASUREMENTS, "falls only with the step above 240 Hz (", 100.0 * exact[3].1);
+    says(MEASUREMENTS, "falls only with the step above 240 Hz (0.021 /", 100.0 * exact[4].1);
+}
+
+#[test]
+fn the_warp_is_that_of_the_report() {
+    let [with, without] = ["warped (default)", "linear, without warp"].map(|name| line("d-warp-bend", name));
+    for (name, before) in [
+        (MEASUREMENTS, "pulled aside by half its length has an error of"),
+        (DECISIONS, "A bar pulled aside by half its length is off by"),
+    ] {
+        says(name, before, 100.0 * with[4].1);
+    }
+    says(MEASUREMENTS, "of the length with the warp and", 100.0 * without[4].1);
+    says(DECISIONS, "of the length with the warp and", 100.0 * without[4].1);
+    says(MEASUREMENTS, "a tenth larger with the warp (", with[2].1);
+    says(MEASUREMENTS, "a tenth larger with the warp (4.9e-3 against", without[2].1);
+    let ratio = |k: usize| with[k].1 / without[k].1 - 1.0;
+    assert!((0.05..0.15).contains(&ratio(1)) && (0.05..0.15).contains(&ratio(2)), "a tenth larger");
+    let twist = ["warped (default)", "linear, without warp"].map(|name| line("d-warp-twist", name));
+    let times = twist[1].last().unwrap().1 / twist[0].last().unwrap().1;
+    says(MEASUREMENTS, "twisted furthest at its end, the error without the warp is", times);
+    says(DECISIONS, "twisted furthest at its end, the error without the warp is", times);
+    let all = |name: &str| line("d-warp-force", &format!("{name}, all of it")).into_iter().map(|p| p.1);
+    let most = all("warped (default)").fold(0.0, f64::max);
+    let least = all("linear, without warp").fold(f64::INFINITY, f64::min);
+    let largest = all("linear, without warp").fold(0.0, f64::max);
+    for name in [MEASUREMENTS, DECISIONS] {
+        says(name, "with a force of up to", most);
+        says(name, "loads (without the warp:", least);
+        says(name, &format!("loads (without the warp: {least:.0} to"), largest);
+    }
+}
+
+#[test]
+fn the_elasticities_are_those_of_the_report() {
+    let at = |line_of: &str, way: u32| {
+        line("h-elasticity-hand", &format!("{line_of}, led by {way} % of the length"))
+    };
+    let best = |all: &[(f64, f64)]| 100.0 * all.iter().map(|p| p.1).fold(f64::INFINITY, f64::min);
+    let [near, far] = [8, 28].map(|way| at("linear", way));
+    let before = "leads by 8 and 28 % of its length, its force is off by";
+    says(DECISIONS, before, best(&near));
+    says(DECISIONS, &format!("{before} 5 and"), best(&far));
+    says(DECISIONS, "% at best, and by", 100.0 * near.last().unwrap().1);
+    says(DECISIONS, "% at best, and by 33 and", 100.0 * far.last().unwrap().1);
+    let [near, far] = [8, 28].map(|way| at("reduced, with the patch's own shapes", way));
+    says(DECISIONS, "with the patch's own shapes is off by", best(&near));
+    says(DECISIONS, "with the patch's own shapes is off by 0.3 and", best(&far));
+}
+
+#[test]
+fn the_speed_of_a_surface_is_that_of_the_report() {
+    let table = row(REPORT, "| armadillo |");
+    says(MEASUREMENTS, "the armadillo (120 modes, 4,394 vertices) reaches", number(&table[8]).0);
+    says(MEASUREMENTS, "the paper's steps a second in single precision, at", number(&table[9]).0);
+    says(MEASUREMENTS, "% of the speed of the memory, and", number(&table[11]).0);
+    let [half, single] = ["f16 basis", "f32 basis (drawn at its rounding)"].map(|name| {
+        let points = line("e-precision", name);
+        points[0]
+    });
+    says(MEASUREMENTS, "The error of a half-precision basis is", half.1);
+    says(DECISIONS, "A half-precision basis is off by", half.1);
+    says(DECISIONS, "of the length, and the surface of a bar of 3,170 vertices and 60 modes takes", half.0);
+    says(DECISIONS, "60 modes takes 48 us instead of", single.0);
+}
+
+#[test]
+fn what_crosses_a_network_is_that_of_the_report() {
+    let rows = read(REPORT);
+    let (_, table) = rows.split_once("| network | loss % |").unwrap();
+    let rows: Vec<Vec<&str>> = table
+        .lines()
+        .filter(|line| line.starts_with("| paper-"))
+        .map(|line| line.trim_matches('|').split('|').map(str::trim).collect())
+        .collect();
+    let all = |way: &str, column: usize| {
+        let found = rows.iter().filter(move |row| row[4] == way);
+        found.map(move |row| row[column].parse::<f64>().unwrap()).collect::<Vec<_>>()
+    };
+    let least = |values: &[f64]| values.iter().copied().fold(f64::INFINITY, f64::min);
+    let most = |values: &[f64]| values.iter().copied().fold(0.0, f64::max);
+    let (ours, up, paper) = (all("default", 5), all("default", 6), all("paper", 5));
+    says(DECISIONS, "A tick takes", least(&ours));
+    says(DECISIONS, "A tick takes", most(&ours));
+    says(DECISIONS, "bytes down to a guest, and", least(&up));
+    says(DECISIONS, "bytes down to a guest, and 55 to", most(&up));
+    says(DECISIONS, "The paper's repair in our frames takes", least(&paper));
+    says(DECISIONS, "The paper's repair in our frames takes 267 to", most(&paper));
+}
+
+#[test]
+fn ways_of_repair_are_told_as_they_were_measured() {
+    let report = read(REPORT);
+    let (_, equal) = report.split_once("All ways with a playout delay").unwrap();
+    let (equal, best) = equal.split_once("Each way with the playout delay").unwrap();
+    let of = |table: &str, network: &str, way: &str, cell: usize| {
+        let start = format!("| {network} | {way} |");
+        let row = table.lines().find(|line| line.starts_with(&start)).unwrap();
+        number(row.trim_matches('|').split('|').nth(cell).unwrap()).0
+    };
+    let motion = |network: &str, way: &str| of(equal, network, way, 4);
+    for (before, real) in [
+        ("for all, the default shows an error of", motion("paper-1", "default")),
+        ("The paper's way shows", motion("paper-1", "paper")),
+        ("with its linear prediction and", motion("paper-1", "paper-zero")),
+        ("in bursts of 4 it shows", motion("paper-1, bursts of 4", "default")),
+        ("of the motion, where the paper's best shows", motion("paper-1, bursts of 4", "paper-zero")),
+        ("In bursts of 12 it shows", motion("paper-1, bursts of 12", "default")),
+        ("and peers with rollback", motion("paper-1, bursts of 12", "peers, rollback")),
+        ("With a playout delay of four ticks,", of(best, "paper-1", "default", 9)),
+    ] {
+        says(DECISIONS, before, real);
+    }
+    for way in ["default", "paper"] {
+        assert!(of(equal, "paper-1", way, 8) < 0.1, "{way}: without tremor, force");
+    }
+    for way in ["default", "paper", "paper-zero", "none"] {
+        assert!(of(best, "paper-1", way, 4) < 0.01, "{way}: all are right");
+    }
+}
+
+#[test]
+fn sessions_of_ten_minutes_are_told_as_they_were_measured() {
+    let worst = row(MEASUREMENTS, "| paper-1 | default |");
+    let [rms, most, kbit] = [2, 3, 7].map(|cell| number(&worst[cell]).0);
+    says(LIMITS, "the visual state is off by", rms);
+    says(LIMITS, "rms of the largest displacement, and by", most);
+    says(DECISIONS, "the worst of 20 sessions shows an error of", rms);
+    says(DECISIONS, &format!("shows an error of {rms} % rms and"), most);
+    says(DECISIONS, "at most, at", kbit);
+}
+
+#[test]
+fn a_small_pull_feels_the_stiffness_of_the_whole_body_as_often_as_was_measured() {
+    let radii = ["0.033", "0.047", "0.067", "0.095", "0.135"];
+    let shares: Vec<f64> = radii
+        .iter()
+        .flat_map(|radius| {
+            let row = row(MEASUREMENTS, &format!("| {radius} |"));
+            [number(&row[1]).0, number(&row[2]).0]
+        })
+        .collect();
+    let least = shares.iter().copied().fold(f64::INFINITY, f64::min);
+    let most = shares.iter().copied().fold(0.0, f64::max);
+    let errors = row(MEASUREMENTS, "| worst error |");
+    let worst = number(&errors[1]).0.max(number(&errors[2]).0);
+    says(DECISIONS, "Of all patches and axes,", least);
+    says(DECISIONS, "Of all patches and axes, 94 to", most);
+    says(DECISIONS, "of the full static solution; the worst is off by", worst);
+    says("docs/concepts.md", "the static stiffness of the whole body within 2 % at", least);
+    says("CHANGELOG.md", "full finite-element solution within 2 % at", least);
+}
+
+#[test]
+fn other_programs_take_as_long_as_was_measured() {
+    let text = read("docs/report/peers.md");
+    let rows: Vec<Vec<&str>> = text
+        .lines()
+        .filter(|line| line.starts_with("| ") && !line.starts_with("| peer") && !line.starts_with("| ---"))
+        .map(|line| line.trim_matches('|').split('|').map(str::trim).collect())
+        .collect();
+    let times = |name: &str, job: &str, column: usize| {
+        let row = rows.iter().find(|row| row[0].starts_with(name) && row[1].contains(job));
+        row.unwrap_or_else(|| panic!("{name}"))[column].parse::<f64>().unwrap()
+    };
+    for (before, real) in [
+        ("| SciPy's `eigsh`, 60 modes of 51,840 tetrahedra |", times("SciPy", "51840", 4)),
+        ("| PyBullet's reduced deformable, a step |", times("PyBullet", "left where", 4)),
+        ("| PyBullet's reduced deformable, a step | 47 (", times("PyBullet", "read by", 4)),
+        ("| MuJoCo's flex, a step |", times("MuJoCo", "a step", 4)),
+        ("| MuJoCo's flex, a step | 69;", times("MuJoCo", "a step", 6)),
+        ("| Exudyn's modal floating frame, a step |", times("Exudyn", "a step", 4)),
+        ("| Rapier's soft body, corotational cells as constraints |", times("Rapier soft body, c", "", 4)),
+        ("| Rapier's soft body, implicit neo-Hookean |", times("Rapier soft body, f", "", 4)),
+    ] {
+        says(MEASUREMENTS, before, real);
+    }
+    says(DECISIONS, "MuJoCo, Exudyn or Rapier takes", times("Exudyn", "a step", 4));
+    says(DECISIONS, "MuJoCo, Exudyn or Rapier takes 33 to", times("Rapier soft body, f", "", 4));
+    says(DECISIONS, "SciPy's `eigsh` takes", times("SciPy", "51840", 4));
+}
+
+#[test]
+fn what_a_scene_leaves_out_is_what_was_measured() {
+    let csv = read("docs/report/leave-out.csv");
+    let head: Vec<&str> = csv.lines().next().unwrap().split(',').collect();
+    let of = |scene: &str, column: &str| -> f64 {
+        let row = csv.lines().find(|row| row.starts_with(&format!("{scene},"))).unwrap();
+        // The second cell may be quoted and have commas. The numbers are counted from the end.
+        let cells: Vec<&str> = row.split(',').collect();
+        let from_end = head.len() - head.iter().position(|name| *name == column).unwrap();
+        cells[cells.len() - from_end].parse().unwrap()
+    };
+    for (before, scene, column) in [
+        ("a body with a window", "solo", "crates"),
+        ("a body with a window 324, a host without a picture", "host", "crates"),
+        ("a host without a picture 214, a guest", "guest", "crates"),
+        ("a guest 358, a body with a haptic device", "haptics", "crates"),
+        ("a haptic device 344, everything", "everything", "crates"),
+        ("`PliantPlugins` adds", "solo", "systems"),
+        ("`PliantPlugins` adds 20 to the engine's", "solo", "engine_systems"),
+        ("drawn by the processor take", "many", "work_frame_ms"),
+        ("a host without a picture is", "host", "program_mb"),
+        ("31 MB, and takes", "host", "rest_frame_ms"),
+        ("0.15 ms for a frame at rest and", "host", "work_frame_ms"),
+        ("A program with a window is", "solo", "program_mb"),
+        ("89 MB, and one with everything", "everything", "program_mb"),
+    ] {
+        says(MEASUREMENTS, before, of(scene, column));
+    }
+    let more = |scene| of(scene, "work_frame_ms") - of(scene, "rest_frame_ms");
+    says(MEASUREMENTS, "In motion, one body adds", more("solo"));
+    says(MEASUREMENTS, "0.16 ms, a guest's body", more("guest"));
+    says(MEASUREMENTS, "0.21 ms, everything together", more("everything"));
+    says(DECISIONS, "A body with a window compiles", of("solo", "crates"));
+    says(DECISIONS, "324 crates, a host without a picture", of("host", "crates"));
+    says(DECISIONS, "214, and everything together", of("everything", "crates"));
+}

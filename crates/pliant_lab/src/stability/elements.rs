@@ -1,0 +1,200 @@
+//! The force in a hand beside full finite elements, which neither modes nor baked flexibilities
+//! enter: of the same mesh, so that what the body leaves out shows, and of a fine mesh, so that
+//! locking and the coarseness of the mesh show.
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use pliant_bake::{Anchor, BakeConfig, Comparison, PrescribedPatch, StaticLoads, bake, deflect};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{Damping, Elasticity, Element, Material, ModalModel, Patch};
+
+use super::{Bound, Case, CaseOutcome, Expected, bodies::nearest_vertex};
+use crate::{
+    LabError,
+    pull::{Pull, pull},
+};
+
+const FORCE: &str = "|force - full finite elements| / full finite elements";
+
+const LOCKS: &str = "four-node elements have one strain each and are too stiff where the body bends or keeps its volume; they are there for speed, and ten-node elements are the default";
+
+const COARSE: &str = "elements four times as long as thick, five along a bar that bends";
+
+/// A shape of size 1 m that is held at one end, and the place of a hand.
+#[derive(Clone, Copy, PartialEq)]
+enum Form {
+    Bar,
+    Cube,
+    Ball,
+}
+
+impl Form {
+    const ALL: [Self; 3] = [Self::Bar, Self::Cube, Self::Ball];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Bar => "bar 5 : 1",
+            Self::Cube => "cube",
+            Self::Ball => "ball",
+        }
+    }
+
+    /// The mesh with a number of cells across the bar, or twice the number across the others.
+    fn mesh(self, cells: usize) -> Result<TetMesh, LabError> {
+        Ok(match self {
+            Self::Bar => shapes::bar([5 * cells, cells, cells], [1.0, 0.2, 0.2])?,
+            Self::Cube => shapes::cube(2 * cells, 1.0)?,
+            Self::Ball => shapes::sphere(2 * cells, 0.5)?,
+        })
+    }
+
+    /// The hand's place, m: the middle of the end, of a side and of the top.
+    fn place(self) -> [f64; 3] {
+        match self {
+            Self::Bar => [1.0, 0.1, 0.1],
+            Self::Cube => [0.5, 0.5, 1.0],
+            Self::Ball => [0.0, 0.0, 0.5],
+        }
+    }
+
+    fn config(self, element: Element) -> BakeConfig {
+        let bound = if self == Self::Ball { -0.3 } else { 1e-9 };
+        BakeConfig {
+            element,
+            modes: 24,
+            damping: Damping::Ratio(0.3),
+            anchors: vec![Anchor { axis: 0, comparison: Comparison::Less, bound }],
+            ..BakeConfig::default()
+        }
+    }
+}
+
+/// A hand: the radius of its patch and its way, m.
+#[derive(Clone, Copy)]
+struct HandPull {
+    radius: f64,
+    by: [f64; 3],
+}
+
+/// So small a way that the linear theory is exact.
+const SMALL: [f64; 3] = [0.5e-6, 1e-6, -0.7e-6];
+
+pub(super) fn cases(out: &mut Vec<Case>) {
+    let group = "full elements";
+    for form in Form::ALL {
+        for element in [Element::Tet4, Element::Tet10] {
+            for radius in [0.06, 0.1, 0.2, 0.3] {
+                let name = format!("{}, {element}, patch of {radius} of the size, same mesh", form.name());
+                out.push(Case::new(group, name, move || {
+                    let config = BakeConfig { sites: Some(96), ..form.config(element) };
+                    same_mesh(form, &config, HandPull { radius, by: SMALL })
+                }));
+            }
+        }
+    }
+    for poisson in [0.0, 0.45] {
+        for young in [1e3, 1e9] {
+            let name = format!("bar 5 : 1, nu {poisson}, E {young:.0e} Pa, same mesh");
+            out.push(Case::new(group, name, move || {
+                let config = BakeConfig { poisson, young, ..Form::Bar.config(Element::Tet10) };
+                same_mesh(Form::Bar, &config, HandPull { radius: 0.12, by: SMALL })
+            }));
+        }
+    }
+    for element in [Element::Tet4, Element::Tet10] {
+        // An even number of cells across has a vertex in the middle of the end.
+        for cells in [[5, 2, 2], [20, 2, 2], [40, 2, 2], [20, 4, 4]] {
+            let [x, y, z] = cells;
+            let name = format!("bar 10 : 1, {element}, {x} x {y} x {z} cells, beside a fine mesh");
+            let case = Case::new(group, name, move || fine_mesh(element, cells));
+            out.push(match (element, cells) {
+                (Element::Tet4, _) => case.limited(LOCKS, Expected::Measured(&[(FORCE, 0.2, 8.0)])),
+                (_, [5, ..]) => case.limited(COARSE, Expected::Measured(&[(FORCE, 0.05, 0.12)])),
+                _ => case,
+            });
+        }
+    }
+    for material in [Material::NeoHookean, Material::StVenantKirchhoff] {
+        for (name, by) in [
+            ("bent by a tenth", [0.0, 0.1, 0.0]),
+            ("bent by three tenths", [-0.05, 0.3, 0.0]),
+            ("stretched by a tenth", [0.1, 0.0, 0.0]),
+            ("pressed by a twentieth", [-0.05, 0.0, 0.0]),
+            ("all at once", [0.05, 0.15, -0.1]),
+        ] {
+            out.push(Case::new(group, format!("bar 5 : 1, reduced, {material}, {name}"), move || {
+                reduced(material, by)
+            }));
+        }
+    }
+}
+
+fn made(mesh: &TetMesh, config: &BakeConfig) -> Result<Arc<ModalModel>, LabError> {
+    Ok(Arc::new(bake(mesh, None, config, &mut |_, _| ())?.model))
+}
+
+/// The force of full finite elements on a hand, N: by linear theory, or with a material for large
+/// strains.
+fn full(
+    at: [f64; 3],
+    mesh: &TetMesh,
+    config: &BakeConfig,
+    material: Option<Material>,
+    held: HandPull,
+) -> Result<Vector3<f64>, LabError> {
+    // The surface of a model is that of its mesh, and one mode suffices for it.
+    let least = BakeConfig { modes: 1, sites: Some(1), material: None, ..config.clone() };
+    let model = made(mesh, &least)?;
+    let vertex = nearest_vertex(&model, at);
+    let patch = Patch::around(model.surface(), vertex, held.radius)?;
+    let prescribed = [PrescribedPatch { patch, displacement: held.by }];
+    let loads = StaticLoads { prescribed: &prescribed, ..StaticLoads::default() };
+    let solved = deflect(mesh, config, material.unwrap_or(Material::StVenantKirchhoff), &loads)?;
+    let forces = if material.is_some() { solved.reactions } else { solved.linear_reactions };
+    Ok(forces.first().map_or_else(|| Vector3::repeat(f64::NAN), |force| (*force).into()))
+}
+
+/// The force of the body on a hand, N, when it is at rest.
+fn felt(
+    at: [f64; 3],
+    model: &Arc<ModalModel>,
+    elasticity: Elasticity,
+    held: HandPull,
+) -> Result<Vector3<f64>, LabError> {
+    let hand = Pull { at, radius: held.radius, by: held.by, elasticity: Some(elasticity), gravity: [0.0; 3] };
+    Ok(pull(model, &hand)?.reaction.into())
+}
+
+fn off(got: Vector3<f64>, want: Vector3<f64>, limit: f64) -> CaseOutcome {
+    CaseOutcome::of(vec![Bound::new(FORCE, (got - want).norm() / want.norm(), limit)])
+}
+
+fn same_mesh(form: Form, config: &BakeConfig, held: HandPull) -> Result<CaseOutcome, LabError> {
+    let mesh = form.mesh(2)?;
+    let got = felt(form.place(), &made(&mesh, config)?, Elasticity::Linear, held)?;
+    Ok(off(got, full(form.place(), &mesh, config, None, held)?, 0.02))
+}
+
+/// A slender bar that a hand at its end bends, so that the shape of the patch matters little.
+fn fine_mesh(element: Element, cells: [usize; 3]) -> Result<CaseOutcome, LabError> {
+    let size = [1.0, 0.1, 0.1];
+    let held = HandPull { radius: 0.06, by: [0.0, 1e-6, 0.5e-6] };
+    let at = [1.0, 0.05, 0.05];
+    let body = made(&shapes::bar(cells, size)?, &Form::Bar.config(element))?;
+    let got = felt(at, &body, Elasticity::Linear, held)?;
+    let want = full(at, &shapes::bar([40, 4, 4], size)?, &Form::Bar.config(Element::Tet10), None, held)?;
+    Ok(off(got, want, 0.05))
+}
+
+fn reduced(material: Material, by: [f64; 3]) -> Result<CaseOutcome, LabError> {
+    let (form, held) = (Form::Bar, HandPull { radius: 0.15, by });
+    let mesh = form.mesh(2)?;
+    let config = BakeConfig {
+        modes: BakeConfig::COORDINATES,
+        material: Some(material),
+        ..form.config(Element::Tet10)
+    };
+    let got = felt(form.place(), &made(&mesh, &config)?, Elasticity::Reduced, held)?;
+    Ok(off(got, full(form.place(), &mesh, &config, Some(material), held)?, 0.03))
+}
