@@ -191,7 +191,7 @@ fn a_hitch_of_the_loop_is_no_kick() {
 }
 
 #[test]
-fn a_word_that_is_not_a_number() {
+fn an_update_that_is_not_a_number() {
     let mut scene = holding();
     for _ in 0..40 {
         scene.tick();

@@ -16,8 +16,9 @@ use std::{
 };
 
 use pliant_haptics::{
-    Cycle, Fault, HapticDevice, HapticLoop, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig,
-    LoopEvent, RealScheduler, SafetyConfig, Sample, Spelling, StaleConfig, VirtualScheduler, Wrench,
+    Calibration, Cycle, Fault, HapticDevice, HapticLoop, Inverse, InverseConfig, InverseError, LocalModel,
+    LoopConfig, LoopEvent, LoopState, RealScheduler, SafetyConfig, Sample, Spelling, StaleConfig,
+    VirtualScheduler, Wrench,
 };
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, accept};
@@ -29,6 +30,10 @@ struct Desk {
     refused: Vec<String>,
     position: [f64; 3],
     buttons: bool,
+    /// What the messages say about the device beside its state. `Null` is left out.
+    status: Value,
+    /// Whether only the inventory contains the status.
+    status_once: bool,
     /// The service sends this text instead of a state.
     say: Option<String>,
     mute: bool,
@@ -43,6 +48,8 @@ struct Desk {
     /// The force on the motors: the last one that was sent, and nothing after the end of the
     /// connection.
     motor: f64,
+    /// The largest rise of the force from one command to the next, N.
+    rise: f64,
     /// Commands without a force that came while an answer was held back.
     zeros: usize,
 }
@@ -133,6 +140,9 @@ fn state(desk: &Desk, new: bool) -> Value {
             "buttons": { "a": desk.buttons, "b": false, "c": true },
         } }],
     });
+    if !desk.status.is_null() {
+        message["inverse3"][1]["status"] = desk.status.clone();
+    }
     if new {
         message["session_id"] = json!(7);
     }
@@ -164,7 +174,9 @@ fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool
         let mut desk = shared.lock().unwrap();
         match check(text.as_str(), new, first) {
             Ok(force) => {
-                desk.motor = force.iter().map(|x| x * x).sum::<f64>().sqrt();
+                let motor = force.iter().map(|x| x * x).sum::<f64>().sqrt();
+                desk.rise = desk.rise.max(motor - desk.motor);
+                desk.motor = motor;
                 desk.forces.push(force);
             }
             Err(why) => {
@@ -174,6 +186,9 @@ fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool
             }
         }
         first = false;
+        if desk.status_once {
+            desk.status = Value::Null;
+        }
         if desk.mute {
             continue;
         }
@@ -346,6 +361,119 @@ fn the_loop_feels_a_spring_through_it() {
     // 0.4 N in 300 ms are 1.3 mN per period.
     assert!(last < -0.3 && largest < 0.002, "comes back by the ramp: {last} N, steps of {largest} N");
     assert_eq!(service.desk().refused, [""; 0]);
+}
+
+/// The `status` of a device that is ready, as the service's documentation shows it.
+fn ready() -> Value {
+    json!({ "calibrated": true, "in_use": true, "power_supply": true, "ready": true, "started": true })
+}
+
+/// A loop in virtual time whose hand stretches a spring of 100 N/m by 4 mm.
+struct Pulled {
+    cycle: Cycle<Inverse>,
+    scheduler: VirtualScheduler,
+    model: LocalModel,
+    events: Vec<LoopEvent>,
+}
+
+impl Pulled {
+    fn new(service: &Service) -> Self {
+        service.desk().position = [0.004, 0.0, 0.0];
+        let device = Inverse::open(second(service.config())).unwrap();
+        let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
+        model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
+        Self {
+            cycle: Cycle::new(device, LoopConfig::default()).unwrap(),
+            scheduler: VirtualScheduler::new(1000.0),
+            model,
+            events: Vec::new(),
+        }
+    }
+
+    fn run(&mut self, periods: usize) {
+        for _ in 0..periods {
+            self.model.tick += 1;
+            self.cycle.step(&mut self.scheduler, &self.model, &mut self.events);
+        }
+    }
+}
+
+/// Says by `field` of the status that something is missing, for a while in the middle of a grab.
+/// Returns the events of that while.
+#[track_caller]
+fn without(field: &str, want: LoopState) -> Vec<LoopEvent> {
+    let service = Service::start(true);
+    service.desk().status = ready();
+    let mut pulled = Pulled::new(&service);
+    pulled.run(400);
+    let before = service.desk().motor;
+    assert!((before - 0.4).abs() < 1e-3, "{field}: {before} N before");
+    pulled.events.clear();
+    service.desk().status[field] = json!(false);
+    // The answer to the first command says it, and the second command is without a force.
+    pulled.run(2);
+    let at_once = service.desk().motor;
+    pulled.run(400);
+    let meanwhile = service.desk().motor;
+    println!("Inverse without `{field}`: {before:.3} N, then {at_once:.3} N, {meanwhile:.3} N in the end");
+    assert_eq!((at_once, meanwhile), (0.0, 0.0), "{field}: no force is sent");
+    assert_eq!(pulled.cycle.report().state, want, "{field}");
+    let events = std::mem::take(&mut pulled.events);
+    service.desk().rise = 0.0;
+    service.desk().status = ready();
+    pulled.run(1000);
+    let after = service.desk().motor;
+    let rise = service.desk().rise;
+    println!("Inverse with `{field}` again: {after:.3} N, rises by at most {rise:.4} N a period");
+    assert!((after - 0.4).abs() < 1e-3, "{field}: {after} N afterwards");
+    // The ramp brings the peak force of 10 N in 0.3 s, and 0.4 N are 1.3 mN per period.
+    assert!(rise < 0.002, "{field}: by the ramp, not by a kick of {rise} N");
+    assert_eq!(pulled.cycle.report().state, LoopState::Running, "{field}");
+    assert_eq!(service.desk().refused, [""; 0]);
+    events
+}
+
+#[test]
+fn an_inverse_that_loses_its_calibration_exerts_no_force() {
+    let events = without("calibrated", LoopState::Calibrating);
+    assert!(events.contains(&LoopEvent::Fault(Fault::NotCalibrated)), "{events:?}");
+    assert!(events.iter().any(|e| matches!(e, LoopEvent::Calibrate(_))), "{events:?}");
+}
+
+#[test]
+fn an_inverse_without_power_or_not_ready_is_switched_off() {
+    for field in ["power_supply", "ready"] {
+        let events = without(field, LoopState::ForceOff);
+        assert!(events.contains(&LoopEvent::Fault(Fault::ForceOff)), "{field}: {events:?}");
+    }
+}
+
+#[test]
+fn an_inverse_is_not_calibrated_until_a_message_says_so() {
+    for (once, says) in [(false, true), (true, false)] {
+        let service = Service::start(true);
+        let mut status = ready();
+        status["calibrated"] = json!(false);
+        service.desk().status = status;
+        // A service that says it in its inventory only is believed until the next connection.
+        service.desk().status_once = once;
+        let mut pulled = Pulled::new(&service);
+        assert!(matches!(pulled.cycle.device_mut().calibration(), Calibration::Needed(_)));
+        pulled.run(400);
+        assert!(service.desk().forces.iter().flatten().all(|x| *x == 0.0), "no force before");
+        if says {
+            service.desk().status = ready();
+        }
+        pulled.run(1000);
+        let motor = service.desk().motor;
+        assert_eq!(motor > 0.39, says, "{motor} N");
+        service.desk().status_once = false;
+        service.desk().status = ready();
+        pulled.cycle.device_mut().reopen().unwrap();
+        pulled.run(1000);
+        let motor = service.desk().motor;
+        assert!(motor > 0.39, "{motor} N after a new connection");
+    }
 }
 
 #[test]

@@ -250,6 +250,93 @@ fn the_emergency_stop_ends_a_drive_to_the_reference() {
     assert!(took < 4.0 * PROMISED, "{took} s");
 }
 
+/// Starts a game on a device that finds its reference by itself, and takes the device away. When
+/// the device is there again, it needs its reference, and drives until somebody ends the drive.
+fn lost_before_a_drive(test: &str) -> (Library, Game) {
+    let path = fake("dhd", test, &["-DWITH_DRD"]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let device = ForceDimension::open(ForceDimensionConfig { auto_init: true, ..dhd(&path) }).unwrap();
+    let mut game = Game::start(device);
+    game.pull(&library);
+    call!(library, "fake_slow_drive", fn(c_int), 1);
+    call!(library, "fake_gone", fn(c_int), 1);
+    call!(library, "fake_reset", fn(c_int), 0);
+    game.until("the device counts as lost", |report| report.state == LoopState::Lost);
+    (library, game)
+}
+
+fn slow_open(library: &Library, open: f64, start: f64) {
+    call!(library, "fake_slow_open", fn(f64, f64), open, start);
+}
+
+/// Returns the number of drives so far, and whether the device drives now.
+fn drives(library: &Library) -> (c_int, bool) {
+    (call!(library, "fake_drives", fn() -> c_int,), call!(library, "fake_driving", fn() -> c_int,) == 1)
+}
+
+/// Looks at a device for some of the loop's attempts to open it. Returns the number of drives that
+/// begin, and the time for which the device drives, s.
+fn driven(game: &mut Game, library: &Library) -> (c_int, f64) {
+    let (before, begun) = (drives(library).0, Instant::now());
+    let (mut last, mut driven) = (begun, 0.0);
+    while begun.elapsed().as_secs_f64() < 2.5 {
+        game.publish();
+        std::thread::sleep(Duration::from_millis(1));
+        let now = Instant::now();
+        if drives(library).1 {
+            driven += (now - last).as_secs_f64();
+        }
+        last = now;
+    }
+    // A drive that nobody ends must not outlast the test.
+    call!(library, "fake_slow_drive", fn(c_int), 0);
+    (drives(library).0 - before, driven)
+}
+
+/// Resets the stop, and waits until the device has driven to its reference and pulls.
+fn drives_again(game: &mut Game, library: &Library) {
+    slow_open(library, 0.0, 0.0);
+    call!(library, "fake_slow_drive", fn(c_int), 0);
+    let before = drives(library).0;
+    assert!(game.running.reset_stop());
+    game.pull(library);
+    assert_eq!(drives(library), (before + 1, false), "the reset lets it drive once");
+}
+
+#[test]
+fn a_latched_emergency_stop_drives_no_device_that_comes_back() {
+    for (name, open) in [("opens at once", 0.0), ("opens slowly", 0.04)] {
+        let (library, mut game) = lost_before_a_drive(&format!("latched_{}", 1e3 * open));
+        game.running.emergency_stop();
+        // The loop sees the stop before it sees the device.
+        std::thread::sleep(Duration::from_millis(50));
+        slow_open(&library, open, 0.0);
+        call!(library, "fake_gone", fn(c_int), 0);
+        let (count, time) = driven(&mut game, &library);
+        println!("Force Dimension, stopped, {name}: {count} drives in 2.5 s, {:.1} ms long", 1e3 * time);
+        assert_eq!(count, 0, "{name}: a stopped device drives for {time:.3} s");
+        drives_again(&mut game, &library);
+    }
+}
+
+#[test]
+fn an_emergency_stop_while_a_device_is_opened_prevents_its_drive() {
+    // The stop comes while the device is being opened, or when its drive is about to begin.
+    for (name, open, start, allowed) in [("opening", 0.3, 0.0, 0), ("about to drive", 0.0, 0.3, 1)] {
+        let (library, mut game) = lost_before_a_drive(&format!("opening_{allowed}"));
+        slow_open(&library, open, start);
+        call!(library, "fake_gone", fn(c_int), 0);
+        game.until("it is being opened", |_| call!(library, "fake_opening", fn() -> c_int,) == 1);
+        game.running.emergency_stop();
+        let (count, time) = driven(&mut game, &library);
+        println!("Force Dimension, stopped while {name}: {count} drives, {:.1} ms long", 1e3 * time);
+        assert!(count <= allowed, "{name}: {count} drives");
+        assert!(time < 4.0 * PROMISED, "{name}: it drives for {time:.3} s");
+        drives_again(&mut game, &library);
+    }
+}
+
 /// Drops `game` on another thread, and returns the time that the drop took, s, if it was at most 5.
 fn seconds_to_drop(game: Game) -> Option<f64> {
     let (sender, receiver) = mpsc::channel();

@@ -355,7 +355,10 @@ fn a_stop_is_reset_for_all_devices_or_for_none() {
         ticks(s) >= begun + 400
     });
     stuck.store(false, Ordering::Relaxed);
-    until(&mut s, "the driver returns", |s| state(s, other) == LoopState::Stopped);
+    let returned = |s: &Scene| s.app.world().resource::<HapticDevices>().get(other).unwrap().report.ticks;
+    let stood = returned(&s);
+    until(&mut s, "the driver returns", |s| returned(s) >= stood + 10);
+    assert_eq!(state(&s, other), LoopState::Stopped);
     s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
     until(&mut s, "both run again", |s| {
         [s.device, other].iter().all(|id| state(s, *id) == LoopState::Running)

@@ -22,7 +22,8 @@ pub enum LoopState {
     Running,
     /// The device waits for its calibration. There is no force.
     Calibrating,
-    /// The device is lost, and the loop tries to reopen it. There is no force.
+    /// The device is lost, and the loop tries to reopen it, unless the emergency stop is latched.
+    /// There is no force.
     Lost,
     /// The emergency stop is latched. There is no force.
     Stopped,
@@ -371,7 +372,9 @@ impl<D: HapticDevice> Cycle<D> {
     }
 
     fn look_for(&mut self, now: f64, sink: &mut dyn Sink) {
-        if now < self.retry_at {
+        // A device may drive by itself when it is opened, so a stopped one stays closed until the
+        // stop is reset.
+        if now < self.retry_at || self.core.is_stopped() {
             return;
         }
         self.retry_at = now + RETRY;
@@ -381,11 +384,8 @@ impl<D: HapticDevice> Cycle<D> {
         let info = self.device.info();
         if info != *self.core.info() {
             // The returned device is a different one. The loop runs with its limits, or the device
-            // stays lost. An emergency stop stays latched.
+            // stays lost.
             let Ok(mut core) = LoopCore::new(info, self.config) else { return };
-            if self.core.is_stopped() {
-                core.emergency_stop();
-            }
             // The copy of the body stays, unless the coupling of the new device differs. In that
             // case the proxy serves until the app sets a new copy.
             let copy = self.core.set_modal(None);

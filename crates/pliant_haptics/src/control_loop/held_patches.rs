@@ -49,7 +49,7 @@ pub(crate) struct When {
 #[derive(Debug, Clone, Copy)]
 struct Slot {
     key: u64,
-    follow: ProxyExtrapolation,
+    extrapolation: ProxyExtrapolation,
     share: f64,
 }
 
@@ -74,7 +74,7 @@ impl HeldPatches {
     pub(crate) fn new(ramp: Option<f64>) -> Self {
         let zero = [Vector3::zeros(); 2];
         Self {
-            slots: [Slot { key: 0, follow: ProxyExtrapolation::default(), share: 1.0 }; MAX_CONTACTS],
+            slots: [Slot { key: 0, extrapolation: ProxyExtrapolation::default(), share: 1.0 }; MAX_CONTACTS],
             count: 0,
             ramp,
             modal: None,
@@ -114,10 +114,10 @@ impl HeldPatches {
             if let Some(j) = known {
                 taken[j] = true;
             }
-            self.slots[i] = known
-                .map_or(Slot { key: contact.key, follow: ProxyExtrapolation::default(), share }, |j| {
-                    before[j]
-                });
+            self.slots[i] = known.map_or(
+                Slot { key: contact.key, extrapolation: ProxyExtrapolation::default(), share },
+                |j| before[j],
+            );
         }
         self.count = contacts.len();
         if self.count == 0 {
@@ -150,7 +150,7 @@ impl HeldPatches {
         let dt = when.dt.min(2.0 * when.period);
         for (contact, slot) in model.contacts().iter().zip(&mut self.slots) {
             let arm = tool.orientation * Vector3::from(contact.offset);
-            let (proxy, speed) = slot.follow.advance(when.now, dt, model, contact);
+            let (proxy, speed) = slot.extrapolation.advance(when.now, dt, model, contact);
             let at = tool.position + arm;
             let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
             let stored = |stretch: Vector3<f64>| 0.5 * stretch.dot(&(k * stretch)).max(0.0);

@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn shown_proxy_is_continuous_and_arrives() {
-        let mut follow = ProxyExtrapolation::default();
+        let mut extrapolation = ProxyExtrapolation::default();
         let mut model = LocalModel { tick: 1, period: 0.025, count: 1, ..LocalModel::default() };
         let mut last = None::<f64>;
         let mut now = 0.0;
@@ -87,7 +87,7 @@ mod tests {
             // The proxy jumps by 1 cm with each update and is sent without a velocity.
             model.contacts[0].proxy = [0.01 * tick as f64, 0.0, 0.0];
             for _ in 0..25 {
-                let (p, _) = follow.advance(now, 1e-3, &model, &model.contacts[0].clone());
+                let (p, _) = extrapolation.advance(now, 1e-3, &model, &model.contacts[0].clone());
                 if let Some(last) = last {
                     // The proxy moves by 1 cm over the 25 periods between two updates.
                     assert!((p.x - last).abs() < 0.01 / 25.0 + 1e-12, "{} after {last}", p.x);
@@ -98,33 +98,33 @@ mod tests {
         }
         for _ in 0..30 {
             now += 1e-3;
-            last = Some(follow.advance(now, 1e-3, &model, &model.contacts[0].clone()).0.x);
+            last = Some(extrapolation.advance(now, 1e-3, &model, &model.contacts[0].clone()).0.x);
         }
         assert!((last.unwrap() - 0.08).abs() < 1e-12, "at rest where it was told to be: {last:?}");
     }
     #[test]
-    fn a_word_every_period_is_taken_at_its_word() {
+    fn an_update_every_period_is_taken_as_it_is() {
         // The simulation is as fast as the loop, or faster. The proxy moves at 0.1 m/s, and the
         // updates contain this velocity.
         for period in [1e-3, 0.5e-3] {
-            let mut follow = ProxyExtrapolation::default();
+            let mut extrapolation = ProxyExtrapolation::default();
             let mut model = LocalModel { period, count: 1, ..LocalModel::default() };
             for tick in 1..=100u64 {
                 let now = tick as f64 * 1e-3;
                 model.tick = tick;
                 model.contacts[0].proxy = [0.1 * now, 0.0, 0.0];
                 model.contacts[0].velocity = [0.1, 0.0, 0.0];
-                let (p, v) = follow.advance(now, 1e-3, &model, &model.contacts[0].clone());
+                let (p, v) = extrapolation.advance(now, 1e-3, &model, &model.contacts[0].clone());
                 assert!((p.x - 0.1 * now).abs() < 1e-12 && (v.x - 0.1).abs() < 1e-12, "{p} {v} at {now}");
             }
         }
     }
 
     #[test]
-    fn words_that_come_in_bursts_are_carried_on_from_burst_to_burst() {
+    fn updates_in_bursts_are_extrapolated_from_burst_to_burst() {
         // The simulation runs 120 steps per second and publishes 30 times per second. A proxy at
         // 0.1 m/s must move evenly, and not for only 8 ms of every 33 ms.
-        let mut follow = ProxyExtrapolation::default();
+        let mut extrapolation = ProxyExtrapolation::default();
         let mut model = LocalModel { period: 1.0 / 120.0, count: 1, ..LocalModel::default() };
         let (mut last, mut worst) = (0.0, 0.0f64);
         for k in 0..1000u32 {
@@ -133,7 +133,7 @@ mod tests {
             model.tick = 1 + 4 * burst as u64;
             model.contacts[0].proxy = [0.1 * burst / 30.0, 0.0, 0.0];
             model.contacts[0].velocity = [0.1, 0.0, 0.0];
-            let (p, _) = follow.advance(now, 1e-3, &model, &model.contacts[0].clone());
+            let (p, _) = extrapolation.advance(now, 1e-3, &model, &model.contacts[0].clone());
             if k > 200 {
                 worst = worst.max((p.x - last - 1e-4).abs());
             }

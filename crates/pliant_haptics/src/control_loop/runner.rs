@@ -72,10 +72,10 @@ pub struct HapticLoop {
     thread: Option<JoinHandle<()>>,
     /// Time at which the thread was asked to quit.
     asked: Option<Instant>,
-    /// `dead` is set if the thread has ended by itself. `last_words` then holds the events about
+    /// `dead` is set if the thread has ended by itself. `final_events` then holds the events about
     /// its end.
     dead: bool,
-    last_words: VecDeque<LoopEvent>,
+    final_events: VecDeque<LoopEvent>,
     clock: LoopClock,
     info: DeviceInfo,
     coupling: Coupling,
@@ -152,7 +152,7 @@ impl HapticLoop {
             thread: Some(thread),
             asked: None,
             dead: false,
-            last_words: VecDeque::new(),
+            final_events: VecDeque::new(),
             clock,
             info,
             coupling,
@@ -209,8 +209,8 @@ impl HapticLoop {
             return;
         }
         let fault = Fault::Hung(silent);
-        if !self.hang_sent && self.last_words.len() < EVENTS {
-            self.last_words.push_back(LoopEvent::Fault(fault));
+        if !self.hang_sent && self.final_events.len() < EVENTS {
+            self.final_events.push_back(LoopEvent::Fault(fault));
         }
         self.hang_sent = true;
         let report = self.report.output_buffer_mut();
@@ -237,8 +237,8 @@ impl HapticLoop {
         self.report.update();
         let report = self.report.output_buffer_mut();
         let down = report.tick.buttons;
-        self.last_words.extend((0..32).filter(|bit| down >> bit & 1 == 1).map(LoopEvent::Released));
-        self.last_words.extend([LoopEvent::Fault(Fault::Panicked), LoopEvent::Lost]);
+        self.final_events.extend((0..32).filter(|bit| down >> bit & 1 == 1).map(LoopEvent::Released));
+        self.final_events.extend([LoopEvent::Fault(Fault::Panicked), LoopEvent::Lost]);
         let count = &mut report.faults[Fault::Panicked.kind()];
         *count = count.saturating_add(1);
         (report.state, report.rate) = (LoopState::Ended, 0.0);
@@ -251,7 +251,7 @@ impl HapticLoop {
     /// Returns the events since the last call, oldest first.
     pub fn events(&mut self) -> impl Iterator<Item = LoopEvent> + '_ {
         self.look_after();
-        std::iter::from_fn(|| self.events.pop().ok().or_else(|| self.last_words.pop_front()))
+        std::iter::from_fn(|| self.events.pop().ok().or_else(|| self.final_events.pop_front()))
     }
 
     /// Moves the workspace in the world. Returns `false` if the map is invalid, or if the queue is
@@ -282,8 +282,14 @@ impl HapticLoop {
     /// because the loop has not processed earlier commands yet, the stop stays pressed, and the
     /// caller should retry.
     pub fn reset_stop(&mut self) -> bool {
-        let has_room = !self.commands.is_full();
+        let has_room = self.can_reset_stop();
         self.stop.reset(has_room, || self.commands.push(LoopCommand::ResetStop).is_ok())
+    }
+
+    /// Whether [`reset_stop`](Self::reset_stop) would unlatch the emergency stop, because the loop
+    /// has room for the command. Only calls to this loop take that room.
+    pub fn can_reset_stop(&self) -> bool {
+        !self.commands.is_full()
     }
 
     /// Starts or stops the recording of every period, see [`records`](Self::records).

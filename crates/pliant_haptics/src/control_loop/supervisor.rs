@@ -33,7 +33,9 @@ pub(crate) fn supervise(
         } else {
             silent > HANG && armed
         };
-        if hangs && !cut && !heartbeat.is_done() {
+        // A cut before a device is open, or before its drive begins, ends nothing. Hence it is
+        // repeated while the device is being opened.
+        if hangs && (!cut || !armed) && !heartbeat.is_done() {
             heartbeat.mark_cut();
             handle.cut();
             if armed {

@@ -169,8 +169,8 @@ impl Touch {
             slot.anchor = if sticks { slot.anchor.or(Some(center)) } else { Some(at + dent) };
             out.stored += 0.5 * force.dot(&dent);
             // The damper is in series with the dent as the spring is. It never pushes harder than
-            // the spring, so that neither the first touch nor the last is a blow, and it stays in
-            // the cone.
+            // the spring, so that neither the first touch nor the last is an impulse, and it stays
+            // in the cone.
             let normal = Vector3::from(slot.plane.normal);
             let damping = ball.relaxation / (soft + normal.dot(&(slot.compliance() * normal)));
             let mut drag = axes * (Vector3::from(slot.plane.velocity) - tool.velocity) * damping;

@@ -9,7 +9,7 @@ use crate::{DeviceInfo, Fault, Sample, clamp_magnitude};
 /// instability of the device's filter.
 const FASTEST: f64 = 10.0;
 /// Time that a new position must hold before it is accepted, s.
-const SETTLE: f64 = 0.02;
+const ACCEPT_AFTER: f64 = 0.02;
 /// Time without a change of the measurement counter after which the device counts as frozen, s.
 const FROZEN_COUNT: f64 = 0.05;
 /// Time of bit-equal positions under a force after which a device without a counter counts as
@@ -120,7 +120,7 @@ impl SampleValidation {
                 let steady = self.raw.is_some_and(|r| (raw - r).norm() <= reach);
                 self.settling = if steady { self.settling + dt } else { 0.0 };
                 self.raw = Some(raw);
-                if self.settling < SETTLE {
+                if self.settling < ACCEPT_AFTER {
                     return self.hold(Fault::Jump(leap));
                 }
                 (jumped, shifted) = (true, true);

@@ -7,6 +7,11 @@
 //! version of the service: `vector` (from 3.5 on) or `values` (before). The driver tries the name
 //! that the inventory suggests first, and the other one if the service refuses the first.
 //!
+//! Beside its state, every message contains the `status` of the device (documented for services
+//! from 3.5 on). A device that is not calibrated gets no force, and its positions are not believed.
+//! A device without its power supply, or that is not ready, counts as switched off. Where a service
+//! leaves the status out, its last one holds, and without any the device counts as ready.
+//!
 //! The service has no call that stops a device. The loop's supervisor sends a last command without
 //! a force on the same connection, beside whatever the loop's thread waits for, and then closes the
 //! connection. What the service does with the force of a connection that is closed, or on which
@@ -29,7 +34,8 @@ use thiserror::Error;
 use tungstenite::{Message, WebSocket, client::client_with_config, protocol::WebSocketConfig};
 
 use crate::{
-    DeviceInfo, Fault, HapticDevice, Sample, Scheduler, StopHandle, Wrench, device::renewal::Renewal,
+    Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, StopHandle, Wrench,
+    device::renewal::Renewal,
 };
 
 /// Address of the service and choice of the device.
@@ -120,11 +126,45 @@ pub struct Inverse {
     /// Whether the field name is known to be right, because a state has come back for it.
     confirmed: bool,
     last: Sample,
+    status: Status,
     sequence: u64,
     switch: Arc<ConnectionSwitch>,
     renewal: Renewal,
     /// Whether the last force was sent too late, so that the next one must be zero.
     late: bool,
+}
+
+/// What the service says about the device beside its state.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Status {
+    calibrated: bool,
+    /// Whether the motors have their power supply.
+    powered: bool,
+    ready: bool,
+}
+
+impl Default for Status {
+    /// Returns the status of a device whose service does not tell it.
+    fn default() -> Self {
+        Self { calibrated: true, powered: true, ready: true }
+    }
+}
+
+impl Status {
+    /// Reads the status in a message. Parts that the service leaves out keep their last values.
+    fn read(device: &Value, last: Self) -> Self {
+        let flag = |name, last| device["status"][name].as_bool().unwrap_or(last);
+        Self {
+            calibrated: flag("calibrated", last.calibrated),
+            powered: flag("power_supply", last.powered),
+            ready: flag("ready", last.ready),
+        }
+    }
+
+    /// Returns whether the motors exert the force that they are sent.
+    fn exerts_force(self) -> bool {
+        self.calibrated && self.powered && self.ready
+    }
 }
 
 /// Ends the connection from another thread, with a command without a force as the last thing it
@@ -188,7 +228,7 @@ impl Inverse {
     /// service, or if it does not have the device.
     pub fn open(config: InverseConfig) -> Result<Self, InverseError> {
         let (socket, inventory) = connect(&config)?;
-        let (id, last) = pick(&config, &inventory)?;
+        let (id, last, status) = pick(&config, &inventory)?;
         // The session id came with version 3.5, as did the new name of the field.
         let guess = if inventory.get("session_id").is_some() { Spelling::Vector } else { Spelling::Values };
         let spelling = config.spelling.unwrap_or(guess);
@@ -200,6 +240,7 @@ impl Inverse {
             spelling,
             confirmed,
             last,
+            status,
             sequence: 0,
             switch: Arc::default(),
             renewal: Renewal::default(),
@@ -293,11 +334,22 @@ impl HapticDevice for Inverse {
         }
     }
 
+    fn calibration(&mut self) -> Calibration {
+        if self.status.calibrated {
+            Calibration::Ready
+        } else {
+            Calibration::Needed(
+                "calibrate the Inverse3 as its maker says; if its service is older than 3.5, \
+                 connect to it anew after that",
+            )
+        }
+    }
+
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         scheduler.wait();
-        // The service may have let go of a force that was not renewed in time. It comes back at
-        // zero.
-        let idle = self.late || self.renewal.has_lapsed();
+        // The service may have let go of a force that was not renewed in time, or the motors may be
+        // switched off. The force comes back at zero.
+        let idle = self.late || self.renewal.has_lapsed() || !self.status.exerts_force();
         let force = if idle { [0.0; 3] } else { wrench.force };
         let answer = match self.ask(force) {
             // The first command was refused, so the service may know the field by its other name.
@@ -317,9 +369,13 @@ impl HapticDevice for Inverse {
         self.sequence += 1;
         self.late = self.renewal.renew();
         let device = find(&answer, &self.id).ok_or(Fault::Gone)?;
+        self.status = Status::read(device, self.status);
+        if !self.status.calibrated {
+            return Err(Fault::NotCalibrated);
+        }
         let sample = sample(device, &answer, &self.last).ok_or(Fault::Malformed)?;
         self.last = sample;
-        Ok(Sample { force_on: !(idle || self.late), ..sample })
+        Ok(Sample { force_on: self.status.exerts_force() && !(idle || self.late), ..sample })
     }
 
     fn safe_stop(&mut self) {
@@ -337,8 +393,7 @@ impl HapticDevice for Inverse {
     fn reopen(&mut self) -> Result<(), Fault> {
         self.abandon();
         let (socket, inventory) = connect(&self.config).map_err(|_| Fault::Gone)?;
-        let (id, last) = pick(&self.config, &inventory).map_err(|_| Fault::Gone)?;
-        (self.id, self.last) = (id, last);
+        (self.id, self.last, self.status) = pick(&self.config, &inventory).map_err(|_| Fault::Gone)?;
         self.take(socket);
         Ok(())
     }
@@ -422,7 +477,7 @@ fn ids(inventory: &Value) -> Vec<String> {
     devices.iter().filter_map(|d| d["device_id"].as_str()).map(String::from).collect()
 }
 
-fn pick(config: &InverseConfig, inventory: &Value) -> Result<(String, Sample), InverseError> {
+fn pick(config: &InverseConfig, inventory: &Value) -> Result<(String, Sample, Status), InverseError> {
     let found = ids(inventory);
     let id = match &config.device {
         Some(wanted) => found.iter().find(|id| *id == wanted),
@@ -435,9 +490,10 @@ fn pick(config: &InverseConfig, inventory: &Value) -> Result<(String, Sample), I
             found,
         });
     };
-    let last =
-        find(inventory, &id).and_then(|d| sample(d, inventory, &Sample::default())).unwrap_or_default();
-    Ok((id, last))
+    let device = find(inventory, &id);
+    let last = device.and_then(|d| sample(d, inventory, &Sample::default())).unwrap_or_default();
+    let status = device.map_or_else(Status::default, |d| Status::read(d, Status::default()));
+    Ok((id, last, status))
 }
 
 fn find<'a>(answer: &'a Value, id: &str) -> Option<&'a Value> {

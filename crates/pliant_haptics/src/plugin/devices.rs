@@ -182,16 +182,19 @@ impl HapticDevices {
     /// Unlatches the emergency stop of all devices. The forces then rise by their ramps. The stop
     /// stays latched, for all of them, if the queue of a loop was full.
     pub fn reset_stop(&mut self) {
-        self.stopped.store(false, Ordering::Release);
-        let mut refused = false;
+        let mut busy = false;
         for entry in &mut self.entries {
-            if !entry.running.get().reset_stop() {
-                refused = true;
+            if !entry.running.get().can_reset_stop() {
+                busy = true;
                 warn!("{}: the emergency stop could not be reset, the loop is busy", entry.status.info.name);
             }
         }
-        if refused {
-            self.estop();
+        if busy {
+            return;
+        }
+        self.stopped.store(false, Ordering::Release);
+        for entry in &mut self.entries {
+            entry.running.get().reset_stop();
         }
     }
 

@@ -103,9 +103,9 @@ pub struct ForceDimensionConfig {
     ///
     /// **The device then drives through its workspace with its own motors** for some seconds. When
     /// it is opened for the first time, Pliant's emergency stop does not reach it meanwhile; when
-    /// it comes back in a running loop, the stop ends the drive by `drdStop`. Keep hands off, and
-    /// keep a thumb on the device's own switch. This setting needs the vendor's DRD library.
-    /// Default: `false`, the user moves the device by hand.
+    /// it comes back in a running loop, the stop ends the drive by `drdStop`, and a latched stop
+    /// keeps the device closed. Keep hands off, and keep a thumb on the device's own switch. This
+    /// setting needs the vendor's DRD library. Default: `false`, the user moves the device by hand.
     pub auto_init: bool,
     /// Index of the device among the connected devices, from 0. Default: 0.
     pub index: u8,
@@ -223,6 +223,8 @@ impl ForceDimension {
 
     fn connect(&mut self) -> Result<(), VendorError> {
         let api = self.api;
+        // What was cut was the device before. A cut from here on is the emergency stop.
+        self.switch.cut.store(false, Ordering::Release);
         // SAFETY: arguments and results are plain values. The library owns the strings.
         unsafe {
             let refused = |what| VendorError::Device {
@@ -247,12 +249,15 @@ impl ForceDimension {
                 && !(robotic.initialized)(id)
             {
                 self.switch.driving.store(true, Ordering::Release);
-                let found = (robotic.auto_init)(id);
+                // A cut before the device was open has reached nothing. The supervisor repeats a
+                // cut that comes between this look and the drive.
+                let cut = || self.switch.cut.load(Ordering::Acquire);
+                let found = if cut() { -1 } else { (robotic.auto_init)(id) };
                 // The control loop of the library is stopped in any case. The forces stay enabled
                 // for Pliant's own loop.
                 let stopped = (robotic.stop)(true, id);
                 self.switch.driving.store(false, Ordering::Release);
-                if found < 0 || stopped < 0 {
+                if found < 0 || stopped < 0 || cut() {
                     let error = refused("drdAutoInit");
                     self.disconnect();
                     return Err(error);

@@ -11,8 +11,8 @@
 struct state {
     double position[3], velocity[3], rotation[3][3], wrench[6], sent_at;
     int made, open, enabled, reset, error, major, buttons, gone, robotic, driving, drives, stuck;
-    int watchdog, expert, cause, user_off, hang, hung, slow;
-    double felt, rise;
+    int watchdog, expert, cause, user_off, hang, hung, slow, opening;
+    double felt, rise, open_time, start_time;
 };
 static struct state own;
 static volatile struct state *state = &own;
@@ -60,10 +60,17 @@ static int result(char id) {
     if (s.gone || !s.open || id != 2) { s.error = 1009; return -1; }
     return 0;
 }
+/* Takes its time within a call that opens the device or makes it ready to drive. */
+static void take(double seconds) {
+    s.opening = seconds > 0;
+    for (double end = now() + seconds; now() < end;) usleep(100);
+    s.opening = 0;
+}
 void dhdGetSDKVersion(int *a, int *b, int *c, int *d) { *a = s.major; *b = 17; *c = 6; *d = 0; }
 int dhdGetDeviceCount(void) { return s.gone ? 0 : 1; }
 int dhdOpenID(char index) {
     if (index != 0 || s.gone) { s.error = 1003; return -1; }
+    take(s.open_time);
     s.open = 1;
     return 2;
 }
@@ -130,6 +137,7 @@ bool drdIsSupported(char id) { return id == 2 && s.robotic; }
 bool drdIsInitialized(char id) { (void)id; return s.reset; }
 int drdAutoInit(char id) {
     if (result(id) < 0 || !s.robotic) return -1;
+    take(s.start_time); /* drdStop finds nothing to stop yet */
     s.driving = 1;
     s.drives++;
     while (s.slow && s.driving) usleep(100); /* it drives until somebody ends it */
@@ -156,6 +164,9 @@ void fake_reset(int r) { s.reset = r; }
 void fake_major(int m) { s.major = m; }
 void fake_gone(int g) { s.gone = g; if (g) s.open = 0; }
 void fake_slow_drive(int on) { s.slow = on; }
+/* Times that the next calls take to open the device and to begin a drive, s. */
+void fake_slow_open(double open, double start) { s.open_time = open; s.start_time = start; }
+int fake_opening(void) { return s.opening; }
 void fake_hang(int on) { s.hang = on; }
 int fake_hung(void) { return s.hung; }
 /* The button on the device that switches its force off. */
