@@ -380,13 +380,13 @@ fn one_too_many(held: usize, impulses: usize) -> [Vec<u8>; 3] {
     };
     let held: Vec<HeldAt> = (0..held as u16).map(hand).collect();
     let impulses = vec![ImpulseAt { body: BODY, vertex: 8, impulse: [0.5, 0.0, -2.0] }; impulses];
-    let (hands, blows) = (25 * held.len(), 18 * impulses.len());
+    let (hands, struck) = (25 * held.len(), 18 * impulses.len());
     let ticks = vec![InputTick { tick: 9, held, impulses }];
     let right = Datagram::Inputs(Inputs { now: 9, ahead: None, ticks, check: None }).encode(1);
     // The last byte tells that no checksum follows. Before it are the impulses with their number,
     // and before these the hands with theirs.
-    let blows_at = right.len() - 1 - blows;
-    let hands_at = blows_at - 1 - hands;
+    let impulses_at = right.len() - 1 - struck;
+    let hands_at = impulses_at - 1 - hands;
     let more = |at: usize, bytes: usize| {
         let mut wrong = right.clone();
         wrong[at - 1] += 1;
@@ -394,7 +394,7 @@ fn one_too_many(held: usize, impulses: usize) -> [Vec<u8>; 3] {
         wrong.splice(at..at, copy);
         wrong
     };
-    [more(hands_at, 25), more(blows_at, 18), right]
+    [more(hands_at, 25), more(impulses_at, 18), right]
 }
 
 #[test]
@@ -404,9 +404,9 @@ fn no_peer_has_more_than_sixteen_hands_and_eight_impulses_at_a_tick() {
         Ok(other) => panic!("{other:?}"),
         Err(error) => Err(error),
     };
-    let [hand, blow, right] = one_too_many(15, 7);
-    assert_eq!([&right, &hand, &blow].map(|bytes| read(bytes)), [Ok((15, 7)), Ok((16, 7)), Ok((15, 8))]);
-    let [hand, blow, right] = one_too_many(16, 8);
+    let [hand, impulse, right] = one_too_many(15, 7);
+    assert_eq!([&right, &hand, &impulse].map(|bytes| read(bytes)), [Ok((15, 7)), Ok((16, 7)), Ok((15, 8))]);
+    let [hand, impulse, right] = one_too_many(16, 8);
     assert_eq!(read(&right), Ok((16, 8)));
     let refused = |bytes: &[u8], name: &str| match read(bytes) {
         Err(StreamError::Invalid { what, .. }) => assert_eq!(what, name),

@@ -8,14 +8,14 @@ mod support;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use pliant_modal::{Body, BodyConfig, GrabId, Patch};
+use pliant_modal::{Body, BodyConfig, GrabId, ModalModel, Patch};
 use pliant_stream::wire::{
-    Datagram, GuestMessage, Nack, NackRun, PROTOCOL_VERSION, Payload, StreamSubscription, TargetEntry,
-    Targets,
+    Datagram, GuestMessage, HostMessage, Nack, NackRun, PROTOCOL_VERSION, Payload, StreamSubscription,
+    TargetEntry, Targets,
 };
 use pliant_stream::{
     BodyId, DisconnectReason, GrabKey, GrabState, HandPlayout, HostEvent, HostSession, HostSessionConfig,
-    PeerId, StepSettings, StreamError, TickState,
+    PeerId, Role, StepSettings, StreamError, TickState, UserId,
 };
 use support::fine_bar;
 
@@ -176,6 +176,165 @@ fn patches_are_charged_by_their_entries() {
     });
     let began = frames.iter().flatten().filter(|e| matches!(e, HostEvent::GrabBegan { .. })).count();
     assert_eq!(began, frames.len());
+}
+
+/// A host where the app says who is in, and under which number.
+fn asking_host() -> HostSession {
+    let mut host = HostSession::new(HostSessionConfig { open: false, ..Default::default() }).unwrap();
+    host.add_body(BODY, "bar", fine_bar(CELLS, 12), StepSettings::default()).unwrap();
+    host
+}
+
+fn enter(host: &mut HostSession, now: Duration, peer: u64, user: u16, hello: &[u8]) {
+    host.connect(now, PeerId(peer), 1200).unwrap();
+    host.on_message(now, PeerId(peer), hello);
+    let given = host.accept_as(now, PeerId(peer), Some(UserId(user)), Role::Hold);
+    assert_eq!(given, Ok(UserId(user)));
+}
+
+fn strike() -> Vec<u8> {
+    GuestMessage::Impulse { body: BODY.0, vertex: 0, impulse: [0.1; 3] }.encode()
+}
+
+/// Sends more than the budgets of impulses, patches and snapshots allow, and thirty times a second
+/// no more messages than are allowed. The radii differ, so that no table has the patches.
+fn spend_all(host: &mut HostSession, now: Duration, peer: u64) {
+    for _ in 0..130 {
+        host.on_message(now, PeerId(peer), &strike());
+    }
+    for grab in 0..2 {
+        let radius = 1.01 + 1e-6 * (now.as_millis() as f64 + f64::from(grab) / 2.0);
+        host.on_message(now, PeerId(peer), &begin(grab, 66, radius));
+        host.on_message(now, PeerId(peer), &GuestMessage::GrabEnd { grab }.encode());
+        host.on_message(now, PeerId(peer), &GuestMessage::SnapshotRequest { body: BODY.0 }.encode());
+    }
+}
+
+/// Adds what was accepted to the sums: entries of patches, patches and impulses, of the first user
+/// and of all others.
+fn accept(host: &mut HostSession, model: &ModalModel, sums: &mut [[usize; 3]; 2]) {
+    for event in std::iter::from_fn(|| host.poll_event()) {
+        match event {
+            HostEvent::GrabBegan { key, vertex, radius, .. } => {
+                let sum = &mut sums[usize::from(key.user.0 != 1)];
+                sum[0] += Patch::around(model.surface(), vertex, radius).unwrap().entries().len();
+                sum[1] += 1;
+            }
+            HostEvent::Impulse { user, .. } => sums[usize::from(user.0 != 1)][2] += 1,
+            _ => {}
+        }
+    }
+}
+
+#[test]
+fn who_comes_again_thirty_times_a_second_spends_no_more_than_who_stays() {
+    let (hello, model) = (hello(), fine_bar(CELLS, 12));
+    let [stays, returns] = [false, true].map(|returns| {
+        let mut host = asking_host();
+        let (mut peer, mut sums, mut snapshots) = (1, [[0; 3]; 2], 0);
+        enter(&mut host, Duration::ZERO, peer, 1, &hello);
+        for k in 1..=5 * FRAMES {
+            let now = 2 * k * Duration::from_secs(1) / FRAMES;
+            if returns {
+                let goodbye = GuestMessage::Goodbye { reason: DisconnectReason::Left };
+                host.on_message(now, PeerId(peer), &goodbye.encode());
+                peer += 1;
+                enter(&mut host, now, peer, 1, &hello);
+            }
+            step(&mut host, now, k.into());
+            while host.poll_output().is_some() {}
+            spend_all(&mut host, now, peer);
+            snapshots += std::iter::from_fn(|| host.poll_output())
+                .filter(|o| matches!(HostMessage::decode(&o.bytes), Ok(HostMessage::Snapshot(_))))
+                .count();
+            accept(&mut host, &model, &mut sums);
+        }
+        let [entries, patches, impulses] = sums[0];
+        println!("{peer} connections of one user in ten seconds: {patches} patches with {entries} entries,");
+        println!("{impulses} impulses and {snapshots} snapshots");
+        assert!(host.stats(PeerId(peer)).is_some(), "it did not break the protocol");
+        (entries, impulses, snapshots)
+    });
+    for (who, (entries, impulses, snapshots)) in [("stays", stays), ("returns", returns)] {
+        assert!(entries <= 16_384 + 10 * 8192 + VERTICES as usize, "{who}: {entries} entries");
+        assert!(entries >= 10 * 8192, "{who}: {entries} entries: what the budget allows is accepted");
+        assert!(impulses <= 120 + 600, "{who}: {impulses} impulses");
+        assert!(snapshots <= 16 + 20, "{who}: {snapshots} snapshots");
+    }
+}
+
+#[test]
+fn many_fresh_users_stay_within_the_budget_of_all_and_cost_nobody_who_was_there() {
+    let (hello, model) = (hello(), fine_bar(CELLS, 12));
+    let mut host = asking_host();
+    enter(&mut host, Duration::ZERO, 1, 1, &hello);
+    let (mut fresh, mut sent, mut sums) = (2, 0, [[0; 3]; 2]);
+    // The honest user is there for five seconds. Then thirty users come each second, of whom each
+    // stays for two seconds, and spends all it can.
+    for k in 1..=15 * FRAMES {
+        let now = k * Duration::from_secs(1) / FRAMES;
+        if k > 5 * FRAMES {
+            if k % 2 == 0 {
+                enter(&mut host, now, fresh, fresh as u16, &hello);
+                fresh += 1;
+            }
+            for peer in fresh.saturating_sub(60).max(2)..fresh {
+                spend_all(&mut host, now, peer);
+            }
+            if fresh > 62 {
+                host.disconnect(PeerId(fresh - 61), DisconnectReason::Left);
+            }
+        }
+        if k % 20 == 0 {
+            sent += 1;
+            let grab = sent as u16;
+            host.on_message(now, PeerId(1), &GuestMessage::GrabEnd { grab: grab - 1 }.encode());
+            host.on_message(now, PeerId(1), &begin(grab, 4 * k, 0.05));
+            host.on_message(now, PeerId(1), &strike());
+        }
+        step(&mut host, now, k.into());
+        while host.poll_output().is_some() {}
+        accept(&mut host, &model, &mut sums);
+    }
+    let [own, [entries, patches, impulses]] = sums;
+    println!("{} fresh users: {patches} patches with {entries} entries, {impulses} impulses", fresh - 2);
+    println!("who was there: {} patches and {} impulses of {sent}", own[1], own[2]);
+    assert_eq!([own[1], own[2]], [sent; 2], "who was there before loses nothing");
+    // What all have together, what each of sixty has as a share, and the last patch.
+    assert!(entries <= 65_536 + 10 * (131_072 + 60 * 512) + VERTICES as usize, "{entries} entries");
+    assert!(patches <= 1024 + 10 * (960 + 60 * 4), "{patches} patches");
+    assert!(impulses <= 2048 + 10 * (3840 + 60 * 15), "{impulses} impulses");
+}
+
+#[test]
+fn two_hundred_and_fifty_six_users_are_not_hindered_by_the_budget_of_all() {
+    let (hello, model) = (hello(), fine_bar(CELLS, 12));
+    let mut host = asking_host();
+    for user in 1..=256 {
+        enter(&mut host, Duration::ZERO, user, user as u16, &hello);
+        while host.poll_output().is_some() {}
+        while host.poll_event().is_some() {}
+    }
+    let (mut sums, mut sent) = ([[0; 3]; 2], 0);
+    for k in 0..10 * FRAMES {
+        let now = k * Duration::from_secs(1) / FRAMES;
+        for user in 1..=256_u16 {
+            // All begin in the first frame, with two hands each, and again seven times a second.
+            let turns = (7 * k + u32::from(user)) / FRAMES - (7 * k.max(1) - 7 + u32::from(user)) / FRAMES;
+            for hand in 0..if k == 0 { 2 } else { turns as u16 } {
+                let peer = PeerId(user.into());
+                host.on_message(now, peer, &GuestMessage::GrabEnd { grab: hand }.encode());
+                host.on_message(now, peer, &begin(hand, 400 + k, 0.05));
+                (0..3).for_each(|_| host.on_message(now, peer, &strike()));
+                sent += 1;
+            }
+        }
+        while host.poll_output().is_some() {}
+        accept(&mut host, &model, &mut sums);
+    }
+    let [patches, impulses] = [1, 2].map(|what: usize| sums[0][what] + sums[1][what]);
+    println!("{patches} patches of {sent} and {impulses} impulses of {}", 3 * sent);
+    assert_eq!([patches, impulses], [sent, 3 * sent]);
 }
 
 #[test]

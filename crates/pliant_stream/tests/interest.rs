@@ -11,7 +11,7 @@ use pliant_stream::{
     BodyId, Channel, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
     PeerId, Placement, Role, StepSettings, TickState, UserId, UserInfo, UserLinkInfo,
 };
-use support::bar;
+use support::{bar, direct};
 
 const BODY: BodyId = BodyId(9);
 const TICK: Duration = Duration::from_millis(25);
@@ -385,4 +385,47 @@ fn a_guest_says_how_much_of_a_body_it_wants() {
     assert_eq!(room.host.users().count(), 1, "it is still in the session");
     let rejected = room.host.stats(PeerId(1)).unwrap().rejected;
     assert_eq!(rejected, 0);
+}
+
+/// The message that a body rests may be read before the frames of the ticks before it.
+#[test]
+fn frames_from_before_a_rest_wake_nobody() {
+    let (mut host, mut guest, mut now) = direct::session("default");
+    let zero = vec![0.0; 12];
+    let q: Vec<f64> = (0..12).map(|k| 0.01 * f64::from(k).cos()).collect();
+    for (tick, resting) in [(60, false), (61, true)] {
+        now += TICK;
+        let state = TickState { tick, q: &q, v: &zero, a: &zero, z: &[], pose: None, grabs: &[], resting };
+        host.publish(now, direct::BODY, &state).unwrap();
+        host.update(now);
+    }
+    let outputs: Vec<_> = std::iter::from_fn(|| host.poll_output()).collect();
+    for output in outputs.iter().filter(|output| output.channel == Channel::Message) {
+        guest.on_message(now, &output.bytes);
+    }
+    assert!(guest.body(direct::BODY).unwrap().is_resting());
+    for output in outputs.iter().filter(|output| output.channel == Channel::Datagram) {
+        guest.on_datagram(now, &output.bytes);
+    }
+    for _ in 0..200 {
+        assert!(guest.body(direct::BODY).unwrap().is_resting(), "a frame has waked the body at {now:?}");
+        now += TICK;
+        direct::exchange(&mut host, &mut guest, now);
+        while let Some(event) = guest.poll_event() {
+            assert!(!matches!(event, GuestEvent::Stalled { .. }), "{event:?}");
+        }
+    }
+    let shown = guest.body(direct::BODY).unwrap().visual().unwrap().q.clone();
+    assert!(shown.iter().zip(&q).all(|(shown, q)| (shown - q).abs() < 1e-6), "{shown:?} {q:?}");
+
+    // It wakes with the first frame after.
+    let v = vec![0.01; 12];
+    for tick in 262..270 {
+        now += TICK;
+        let state =
+            TickState { tick, q: &q, v: &v, a: &zero, z: &[], pose: None, grabs: &[], resting: false };
+        host.publish(now, direct::BODY, &state).unwrap();
+        direct::exchange(&mut host, &mut guest, now);
+    }
+    assert!(!guest.body(direct::BODY).unwrap().is_resting());
 }

@@ -8,9 +8,9 @@ mod support;
 use std::time::{Duration, Instant};
 
 use pliant_modal::FixedObstacle;
-use pliant_stream::peer::PeerSession;
-use pliant_stream::wire::{Datagram, HeldAt, ImpulseAt, InputTick, Inputs};
-use pliant_stream::{Channel, PeerId, Surroundings};
+use pliant_stream::peer::{PeerEvent, PeerSession};
+use pliant_stream::wire::{Datagram, HeldAt, ImpulseAt, InputTick, Inputs, PROTOCOL_VERSION, PeerMessage};
+use pliant_stream::{Channel, DisconnectReason, PeerId, Surroundings, UserId};
 use support::direct::{BODY, peers, peers_of};
 use support::loose_bar;
 
@@ -31,9 +31,9 @@ fn sixteen(tick: u64) -> InputTick {
     InputTick { tick, held: (0..16).map(hand).collect(), impulses: Vec::new() }
 }
 
-fn blows(tick: u64, count: u32) -> InputTick {
-    let blow = |k: u32| ImpulseAt { body: BODY, vertex: 4 + 3 * k, impulse: [0.0, 1e-3, 0.0] };
-    InputTick { tick, held: Vec::new(), impulses: (0..count).map(blow).collect() }
+fn impulses(tick: u64, count: u32) -> InputTick {
+    let impulse = |k: u32| ImpulseAt { body: BODY, vertex: 4 + 3 * k, impulse: [0.0, 1e-3, 0.0] };
+    InputTick { tick, held: Vec::new(), impulses: (0..count).map(impulse).collect() }
 }
 
 /// What the first peer has done in the attack, by update.
@@ -121,13 +121,15 @@ fn late_impulses_are_paid_for_as_late_hands_are_and_contacts_besides() {
     // A single impulse may come as late as can be, unless the body has contacts.
     let among = || peers_of(BEGIN, &loose_bar(12, 0.05), &floor);
     let apart = || peers_of(BEGIN, &loose_bar(12, 0.05), &Surroundings::default());
-    let eight = |tick| blows(tick, 8);
-    let one = |tick| blows(tick, 1);
+    let eight = |tick| impulses(tick, 8);
+    let one = |tick| impulses(tick, 1);
+    let none = |tick| impulses(tick, 0);
     for (what, late, all, input, most) in [
         ("eight impulses", 127, peers(BEGIN), eight as fn(u64) -> InputTick, 17),
         ("eight impulses", 15, peers(BEGIN), eight, 17),
         ("one impulse", 127, apart(), one, 127),
         ("one impulse with contacts", 127, among(), one, 17),
+        ("nothing, and a body has contacts", 127, among(), none, 17),
     ] {
         let (all, cost) = attack(late, all, input);
         let largest = *cost.restepped.iter().max().unwrap();
@@ -141,6 +143,119 @@ fn late_impulses_are_paid_for_as_late_hands_are_and_contacts_besides() {
         assert!(largest <= most, "{what}: {:?}", cost.restepped);
         assert!(most < 127 || largest > 100, "{what}: what can be afforded is taken");
     }
+}
+
+/// Ten seconds in which a fourth peer comes to the first of three in each tick and leaves in the
+/// next one. Returns the ticks that were stepped again, the patches that were made, and the states
+/// that were sent to the fourth peer.
+fn comes_and_goes(then: impl Fn(&mut PeerSession, Duration, PeerId, u64)) -> [u64; 3] {
+    let mut all = peers(BEGIN);
+    let (mut now, mut states) = (BEGIN, 0);
+    let mut before = [0; 2];
+    for round in 0..600_u64 {
+        now += TICK;
+        if round >= 200 {
+            all[0].disconnect(PeerId(round - 1), DisconnectReason::Left);
+            let (peer, scene) = (PeerId(round), all[0].scene());
+            all[0].accept(now, peer, 1200).unwrap();
+            let hello = PeerMessage::Hello {
+                version: PROTOCOL_VERSION,
+                user: 4,
+                name: "fourth".into(),
+                address: String::new(),
+                joining: false,
+                scene,
+            };
+            all[0].on_message(now, peer, &hello.encode());
+            assert_eq!(all[0].user_of(peer), Some(UserId(4)));
+            then(&mut all[0], now, peer, round);
+        } else {
+            let body = all[0].body(BODY).unwrap();
+            before = [body.restepped(), body.patches_made()];
+        }
+        for from in 0..3 {
+            all[from].update(now);
+            while let Some(o) = all[from].poll_output() {
+                let sender = PeerId(from as u64);
+                match (all.get_mut(o.peer.0 as usize), o.channel) {
+                    (Some(to), Channel::Datagram) => to.on_datagram(now, sender, &o.bytes),
+                    (Some(to), Channel::Message) => to.on_message(now, sender, &o.bytes),
+                    (None, Channel::Datagram) => {}
+                    (None, Channel::Message) => {
+                        let message = PeerMessage::decode(&o.bytes);
+                        states += u64::from(matches!(message, Ok(PeerMessage::State { .. })));
+                    }
+                }
+            }
+        }
+    }
+    let body = all[0].body(BODY).unwrap();
+    [body.restepped() - before[0], body.patches_made() - before[1], states]
+}
+
+#[test]
+fn a_peer_that_comes_and_goes_and_does_nothing_makes_nobody_step_again() {
+    let [steps, ..] = comes_and_goes(|_, _, _, _| {});
+    println!("{steps} ticks stepped again in ten seconds, which are 400 ticks");
+    // Inputs of the peers that stay come up to one tick late.
+    assert!(steps <= 400, "{steps} ticks stepped again");
+}
+
+#[test]
+fn a_peer_that_comes_and_goes_has_the_budgets_of_one_that_stays() {
+    let [steps, patches, states] = comes_and_goes(|first, now, peer, round| {
+        let inputs =
+            Inputs { now: first.tick(), ahead: None, ticks: vec![sixteen(first.tick() + 1)], check: None };
+        first.on_datagram(now, peer, &Datagram::Inputs(inputs).encode(round as u16));
+        first.on_message(now, peer, &PeerMessage::StateRequest.encode());
+    });
+    println!("{steps} ticks stepped again, {patches} patches made and {states} states sent in ten seconds");
+    assert!(patches <= 120 + 60 * 10, "{patches} patches");
+    assert!(states <= 16 + 2 * 10, "{states} states");
+}
+
+#[test]
+fn who_leaves_with_many_hands_after_a_silence_makes_nobody_step_many_ticks_again() {
+    let mut all = peers(BEGIN);
+    for vertex in 0..15 {
+        all[2].begin_grab(BODY, 20 + vertex, 0.05, [1.0, 0.1, 0.0], Default::default()).unwrap();
+    }
+    let (mut now, mut most, mut repaired) = (BEGIN, 0, None);
+    for round in 0..600_u64 {
+        now += TICK;
+        if round == 260 {
+            for rest in &mut all[..2] {
+                rest.disconnect(PeerId(2), DisconnectReason::Left);
+            }
+        }
+        for from in 0..if round < 260 { 3 } else { 2 } {
+            let before = all[from].body(BODY).unwrap().restepped();
+            all[from].update(now);
+            most = most.max(all[from].body(BODY).unwrap().restepped() - before);
+            while let Some(event) = all[from].poll_event() {
+                if round >= 260 && matches!(event, PeerEvent::Resynced { .. }) {
+                    repaired.get_or_insert((from, round - 260));
+                }
+            }
+            while let Some(o) = all[from].poll_output() {
+                let to = o.peer.0 as usize;
+                match o.channel {
+                    Channel::Datagram if from == 2 && round >= 200 => {}
+                    Channel::Datagram => all[to].on_datagram(now, PeerId(from as u64), &o.bytes),
+                    Channel::Message => all[to].on_message(now, PeerId(from as u64), &o.bytes),
+                }
+            }
+        }
+    }
+    println!("{most} ticks stepped again at most in an update");
+    // The peer with the lower number is right, so the other one takes its state.
+    assert!(repaired.is_some_and(|(peer, after)| peer == 1 && after < 5), "{repaired:?}");
+    let confirmed = all[0].confirmed().min(all[1].confirmed());
+    assert!(confirmed + 10 > all[0].tick(), "{confirmed} of {}", all[0].tick());
+    let of = |k: usize| &all[k].state_at(BODY, confirmed).unwrap().q;
+    let off: f64 = of(0).iter().zip(of(1)).map(|(a, b)| (a - b).abs()).sum();
+    assert!(off < 1e-6, "those who stay agree: {off}");
+    assert!(most <= 17, "{most} ticks stepped again in an update");
 }
 
 /// The time of an update. Run by hand, on a quiet machine and with `--release`.

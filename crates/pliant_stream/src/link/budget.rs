@@ -1,8 +1,15 @@
 //! Rate limits.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use pliant_modal::ModalModel;
+
+use crate::state::UserId;
+
+/// Largest number of users that are away and whose budgets are kept. Budgets refill within some ten
+/// seconds, so that those who left before that many others have mostly full ones.
+const MAX_AWAY: usize = 4096;
 
 /// A token bucket.
 #[derive(Debug, Clone)]
@@ -17,6 +24,11 @@ impl Budget {
     /// Creates a full bucket that gains `rate` per second and holds at most `most`.
     pub(crate) fn new(rate: f64, most: f64) -> Self {
         Self { rate, most, left: most, at: Duration::ZERO }
+    }
+
+    /// Creates an empty bucket, which is filled from `now` on.
+    pub(crate) fn empty(now: Duration, rate: f64, most: f64) -> Self {
+        Self { left: 0.0, at: now, ..Self::new(rate, most) }
     }
 
     fn refill(&mut self, now: Duration) {
@@ -42,7 +54,7 @@ impl Budget {
 
     /// Takes `amount` if anything is available, and returns whether it was. What is lacking is
     /// owed, so that an amount larger than the bucket can be spent, at the same rate.
-    fn spend_or_owe(&mut self, now: Duration, amount: f64) -> bool {
+    pub(crate) fn spend_or_owe(&mut self, now: Duration, amount: f64) -> bool {
         let any = self.has(now, f64::MIN_POSITIVE);
         if any {
             self.left -= amount;
@@ -63,8 +75,8 @@ impl Budget {
 /// vertices.
 #[derive(Debug, Clone)]
 pub(crate) struct PatchBudget {
-    patches: Budget,
-    entries: Budget,
+    pub(crate) patches: Budget,
+    pub(crate) entries: Budget,
 }
 
 impl Default for PatchBudget {
@@ -86,9 +98,72 @@ impl PatchBudget {
 }
 
 /// Number of vertices within the radius, of which a patch has some or all.
-fn entries(model: &ModalModel, vertex: u32, radius: f64) -> f64 {
+pub(crate) fn entries(model: &ModalModel, vertex: u32, radius: f64) -> f64 {
     let positions = model.surface().positions();
     let Some(center) = positions.get(vertex as usize) else { return 1.0 };
     let distance2 = |p: &[f32; 3]| (0..3).map(|k| f64::from(p[k] - center[k]).powi(2)).sum::<f64>();
     positions.iter().filter(|p| distance2(p) <= radius * radius).count() as f64
+}
+
+/// The budget of the snapshots or states that one user gets.
+pub(crate) fn state_budget() -> Budget {
+    Budget::new(2.0, 16.0)
+}
+
+/// Budgets of users that are away. Nobody gains by leaving and coming back, since a budget is
+/// filled at its next use by the time that has passed, as if its user had stayed.
+#[derive(Debug)]
+pub(crate) struct AwayBudgets<B> {
+    /// Who has left last comes last.
+    users: VecDeque<(UserId, B)>,
+}
+
+impl<B> Default for AwayBudgets<B> {
+    fn default() -> Self {
+        Self { users: VecDeque::new() }
+    }
+}
+
+impl<B> AwayBudgets<B> {
+    /// Keeps the budgets of a user that leaves. Who left longest ago is forgotten first, since its
+    /// budgets are the fullest.
+    pub(crate) fn keep(&mut self, user: UserId, budgets: B) {
+        self.take(user);
+        if self.users.len() >= MAX_AWAY {
+            self.users.pop_front();
+        }
+        self.users.push_back((user, budgets));
+    }
+
+    /// Returns the budgets of a user that comes back.
+    pub(crate) fn take(&mut self, user: UserId) -> Option<B> {
+        let at = self.users.iter().position(|(away, _)| *away == user)?;
+        self.users.remove(at).map(|(_, budgets)| budgets)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_comes_back_has_what_it_left_and_what_time_has_added() {
+        let mut away = AwayBudgets::default();
+        let mut budget = Budget::new(2.0, 16.0);
+        assert!(budget.spend(Duration::from_secs(1), 16.0));
+        away.keep(UserId(7), budget);
+        let back = away.take(UserId(7));
+        assert!(back.is_some_and(|mut b| b.has(Duration::from_secs(4), 6.0) && !b.has(Duration::ZERO, 6.5)));
+        assert!(away.take(UserId(7)).is_none(), "it is not away any more");
+    }
+
+    #[test]
+    fn of_too_many_that_are_away_the_one_that_left_first_is_forgotten() {
+        let mut away = AwayBudgets::default();
+        for user in 0..=MAX_AWAY as u16 {
+            away.keep(UserId(user), user);
+        }
+        assert_eq!(away.users.len(), MAX_AWAY);
+        assert_eq!([0, 1].map(|user| away.take(UserId(user))), [None, Some(1)]);
+    }
 }

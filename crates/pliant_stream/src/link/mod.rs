@@ -9,7 +9,7 @@ mod tally;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-pub(crate) use budget::{Budget, PatchBudget};
+pub(crate) use budget::{AwayBudgets, Budget, PatchBudget, entries, state_budget};
 pub(crate) use events::Events;
 pub use stats::LinkStats;
 
@@ -19,8 +19,8 @@ use crate::wire::{Clock, ReceiverReport};
 use round_trip::RoundTrip;
 use tally::{DatagramArrival, Tally, loss_of};
 
-/// State of a connection: sequence numbers, loss, round trip, time of the last reception, budgets,
-/// and counts.
+/// State of a connection: sequence numbers, loss, round trip, time of the last reception, and
+/// counts.
 #[derive(Debug)]
 pub(crate) struct Link {
     peer: PeerId,
@@ -31,12 +31,6 @@ pub(crate) struct Link {
     received: Tally,
     round_trip: RoundTrip,
     last_round_trips: [Duration; 2],
-    /// Budget of the other side's new patches.
-    pub(crate) patches: PatchBudget,
-    /// Budget of the snapshots or states that the other side gets.
-    pub(crate) states: Budget,
-    /// Budget of the ticks that are sent again to the other side.
-    pub(crate) repeats: Budget,
     /// Counts, and values that only one role measures. [`Link::stats`] adds the other values.
     pub(crate) stats: LinkStats,
 }
@@ -51,11 +45,6 @@ impl Link {
             received: Tally::default(),
             round_trip: RoundTrip::default(),
             last_round_trips: [Duration::ZERO; 2],
-            patches: PatchBudget::default(),
-            states: Budget::new(2.0, 16.0),
-            // This covers 60 Hz at full loss with every tick requested eight times, for several
-            // bodies at once. At once, four bodies' whole past may be requested.
-            repeats: Budget::new(4000.0, 1024.0),
             stats: LinkStats::default(),
         }
     }

@@ -41,6 +41,11 @@ impl UserInputs {
         self.slots.get(tick)
     }
 
+    /// The newest input that is known, from which hands go on.
+    pub(crate) fn newest(&self) -> Option<&InputTick> {
+        (0..WINDOW as u64).map_while(|back| self.highest.checked_sub(back)).find_map(|tick| self.at(tick))
+    }
+
     /// Returns whether the input of a tick is missing and not too old.
     fn lacks(&self, tick: Tick) -> bool {
         tick + (WINDOW as u64) > self.highest && self.at(tick).is_none()
@@ -107,8 +112,8 @@ impl InputLog {
     /// input.
     pub(crate) fn forget_gone(&mut self, tick: Tick) {
         self.users.retain(|_, u| {
-            let said_nothing = u.highest < u.first;
-            !(u.gone && (said_nothing || u.highest + WINDOW as u64 <= tick))
+            let is_missing = u.highest < u.first;
+            !(u.gone && (is_missing || u.highest + WINDOW as u64 <= tick))
         });
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::link::{Budget, Link};
+use crate::link::{Budget, Link, PatchBudget, state_budget};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::PeerBodyState;
 
@@ -28,11 +28,40 @@ pub(super) struct PartialState {
     pub(super) bodies: BTreeMap<u16, PeerBodyState>,
 }
 
+/// The budgets of one peer. They are kept while it is away.
+#[derive(Debug)]
+pub(super) struct PeerBudgets {
+    /// New patches.
+    pub(super) patches: PatchBudget,
+    /// States that are sent to the peer.
+    pub(super) states: Budget,
+    /// Ticks that are sent again to the peer.
+    pub(super) repeats: Budget,
+    /// What the peer's late inputs cost: for each tick that is stepped again, one and one for each
+    /// hand.
+    pub(super) late: Budget,
+}
+
+impl PeerBudgets {
+    fn new(step: f64) -> Self {
+        Self {
+            patches: PatchBudget::default(),
+            states: state_budget(),
+            // Inputs are the same for all bodies. A request for the whole window every 150 ms is
+            // 853 ticks a second, and a well-behaved peer requests no more.
+            repeats: Budget::new(1000.0, 1000.0),
+            // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
+            // each tick, one with one hand may be 96 ticks late, and one with ten 17.
+            late: Budget::new(192.0 / step, 256.0),
+        }
+    }
+}
+
 #[derive(Debug)]
 pub(super) struct RemotePeer {
     pub(super) link: Link,
-    /// When the peer last told of others.
-    pub(super) told_at: Option<Duration>,
+    /// When the peer last announced others.
+    pub(super) announced_at: Option<Duration>,
     /// User number of the peer, after its hello.
     pub(super) user: Option<UserId>,
     /// User number that the peer must have; `None` when its hello tells it.
@@ -59,9 +88,8 @@ pub(super) struct RemotePeer {
     pub(super) asked_state: bool,
     /// What has come of the peer's state.
     pub(super) partial: Option<PartialState>,
-    /// Budget of what the peer's late inputs cost: for each tick that is stepped again, one and one
-    /// for each hand.
-    pub(super) late_budget: Budget,
+    /// What the peer may cost this one. This outlives the connection.
+    pub(super) budgets: PeerBudgets,
 }
 
 impl RemotePeer {
@@ -72,13 +100,9 @@ impl RemotePeer {
         max_datagram: usize,
         step: f64,
     ) -> Self {
-        let mut link = Link::new(peer, now, max_datagram);
-        // Inputs are the same for all bodies. A request for the whole window every 150 ms is 853
-        // ticks a second, and a well-behaved peer requests no more.
-        link.repeats = Budget::new(1000.0, 1000.0);
         Self {
-            link,
-            told_at: None,
+            link: Link::new(peer, now, max_datagram),
+            announced_at: None,
             user: None,
             expected,
             greeted: false,
@@ -93,9 +117,7 @@ impl RemotePeer {
             wants_state: false,
             asked_state: false,
             partial: None,
-            // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
-            // each tick, one with one hand may be 96 ticks late, and one with ten 17.
-            late_budget: Budget::new(192.0 / step, 256.0),
+            budgets: PeerBudgets::new(step),
         }
     }
 

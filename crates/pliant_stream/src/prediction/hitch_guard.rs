@@ -6,8 +6,8 @@
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
 //! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
 //! second, until the host has the hand where this guest sent it. The same holds for a second after
-//! another's hand has come or gone, and after news that has changed what the copy predicts by more
-//! than a twentieth of that measure. Where no frame comes at all, the reaction fades.
+//! another's hand has come or gone, and after an event that has changed what the copy predicts by
+//! more than a twentieth of that measure. Where no frame comes at all, the reaction fades.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -25,8 +25,8 @@ const AFTER: Duration = Duration::from_secs(1);
 const PROLONGED: Duration = Duration::from_millis(250);
 /// How far a reaction may exceed the largest that the body gave.
 const BEYOND: f64 = 1.2;
-/// Change of a predicted reaction by news from the host that counts as a surprise, as a share of
-/// the largest reaction that the body gave.
+/// Change of a predicted reaction by an event from the host that counts as a surprise, as a share
+/// of the largest reaction that the body gave.
 const SURPRISE: f64 = 0.05;
 /// Time constant with which a reaction fades where no frame comes, s.
 const FADE: f64 = 0.1;
@@ -101,8 +101,9 @@ impl HitchGuard {
         }
     }
 
-    /// Bounds for a second, as [`HitchGuard::disturb`] does, where news from the host has changed
-    /// what the copy predicts by so many newtons: another's hand moves as no forecast can know.
+    /// Bounds for a second, as [`HitchGuard::disturb`] does, where an event from the host has
+    /// changed what the copy predicts by so many newtons: another's hand moves as no forecast can
+    /// know.
     pub(crate) fn surprise(&mut self, now: Duration, change: f64) {
         if change > SURPRISE * self.most() {
             self.disturb(now);

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use pliant_modal::{HeldShapes, ModalModel};
 
+use super::budgets::impulse_budget;
 use super::download::Download;
 use super::guest_body::StreamedBody;
 use super::guest_config::{GuestEvent, GuestSessionConfig};
 use super::guest_hands::LocalGrab;
-use super::host_peer::impulse_budget;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;

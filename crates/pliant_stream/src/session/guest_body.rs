@@ -60,6 +60,8 @@ pub struct StreamedBody {
     /// Ticks up to here need no NACK: they are known, or lie before the run or the snapshot.
     resolved: Tick,
     resting: bool,
+    /// Tick at which the body came to rest, if the last snapshot said that it rests.
+    rests_at: Option<Tick>,
     fade_at: Duration,
     stalled: bool,
     received_at: Duration,
@@ -95,6 +97,7 @@ impl StreamedBody {
             requests: Ring::new(HISTORY),
             resolved: 0,
             resting: false,
+            rests_at: None,
             fade_at: Duration::ZERO,
             stalled: false,
             received_at: Duration::ZERO,
@@ -245,6 +248,7 @@ impl StreamedBody {
     /// Takes a snapshot. Returns true when the body became ready with it.
     pub(crate) fn take_snapshot(&mut self, now: Duration, snapshot: SnapshotBytes) -> bool {
         self.resting = snapshot.resting;
+        self.rests_at = snapshot.resting.then_some(snapshot.tick);
         self.received_at = now;
         self.wants_snapshot = false;
         let modes = snapshot.q.len();
@@ -342,15 +346,17 @@ impl StreamedBody {
             let stands = matches!(self.config.policy, Policy::ForceDriven { .. }) && quiet > QUIET;
             self.waits_for = if stands { LATE_ROW } else { self.waits_for.saturating_sub(1) };
         }
+        // Messages may arrive before earlier frames. These wake nobody.
+        let before_rest = self.rests_at.is_some_and(|tick| frame.tick <= tick);
         let before_run = frame.tick.saturating_sub(u64::from(frame.run) + 1);
         if frame.run < u16::MAX && before_run > self.resolved {
             self.resolved = before_run;
-            if self.resting && !frame.resting {
+            if self.resting && !frame.resting && !before_rest {
                 // The body wakes up: the sleeping state is the state before the run.
                 receiver.skip_to(before_run);
             }
         }
-        self.resting = frame.resting;
+        self.resting = frame.resting || before_rest && self.resting;
         receiver.accept(&frame);
         if self.resting {
             self.resync();

@@ -139,7 +139,7 @@ impl GuestSession {
             return Err(StreamError::NotFinite { what: "impulse" });
         }
         if !self.impulse_budget.spend(now, 1.0) {
-            return Err(StreamError::Full { what: "impulses", limit: super::host_peer::IMPULSES_AT_ONCE });
+            return Err(StreamError::Full { what: "impulses", limit: super::budgets::IMPULSES_AT_ONCE });
         }
         self.message(&GuestMessage::Impulse { body: body.0, vertex, impulse });
         Ok(())

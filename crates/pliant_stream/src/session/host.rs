@@ -6,13 +6,14 @@ use std::time::Duration;
 
 use pliant_modal::{ModalModel, StepSettings};
 
+use super::budgets::{GuestBudgets, SharedBudgets};
 use super::guest_hands::TARGET_REPEATS;
 use super::host_config::{HostEvent, HostSessionConfig};
 use super::host_peer::{AnnouncedGrab, GuestPeer, MAX_GUEST_GRABS, Standing};
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::codec::encoder::Encoder;
-use crate::link::Events;
+use crate::link::{AwayBudgets, Events};
 use crate::newmark::Newmark;
 use crate::state::{
     BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo, capped_impulse, next_free,
@@ -90,6 +91,10 @@ pub struct HostSession {
     pub(super) upload: Upload,
     pub(super) encoded: u64,
     pub(super) encoders_made: u64,
+    /// What all guests together may cost the host.
+    shared: SharedBudgets,
+    /// Budgets of the users that are away.
+    away: AwayBudgets<GuestBudgets>,
     /// Counts of the connections that have ended.
     gone: LinkStats,
 }
@@ -120,6 +125,8 @@ impl HostSession {
             upload,
             encoded: 0,
             encoders_made: 0,
+            shared: SharedBudgets::of_all(),
+            away: AwayBudgets::default(),
             gone: LinkStats::default(),
         })
     }
@@ -309,7 +316,7 @@ impl HostSession {
                     // The input is newer when it is ahead by less than half the range, since the
                     // counter may wrap.
                     let newer = held.input.is_none_or(|last| (e.input.wrapping_sub(last) as i32) > 0);
-                    if newer && p.target_budget.spend(now, 1.0) {
+                    if newer && p.budgets.targets.spend(now, 1.0) {
                         held.input = Some(e.input);
                         let key = GrabKey { user, grab: e.grab };
                         moved.push(HostEvent::GrabMoved {
@@ -327,7 +334,7 @@ impl HostSession {
                 let streams = p.streaming.contains(&nack.body);
                 let runs = nack.runs.iter().filter(|_| streams);
                 for tick in runs.flat_map(|r| r.first..r.first + u64::from(r.count)) {
-                    if !p.link.repeats.spend(now, 1.0) {
+                    if !p.budgets.repeats.spend(now, 1.0) {
                         break;
                     }
                     // A tick that is already queued needs no second answer.
@@ -357,7 +364,7 @@ impl HostSession {
             // A guest may change its interest in every body at once, so these messages have a
             // budget of their own. Beyond it they have no effect.
             Ok(GuestMessage::Interest { body, modes }) if p.user().is_some() => {
-                if p.interest_budget.spend(now, 1.0) {
+                if p.budgets.interests.spend(now, 1.0) {
                     self.set_interest(peer, BodyId(body), modes);
                 }
                 return;
@@ -366,7 +373,7 @@ impl HostSession {
             Ok(GuestMessage::Impulse { body, vertex, impulse }) if p.user().is_some() => {
                 let body = BodyId(body);
                 let model = self.bodies.get(&body).map(|b| &b.model);
-                let fits = p.role == Role::Hold && p.impulse_budget.spend(now, 1.0);
+                let fits = p.role == Role::Hold && p.pays_for_impulse(&mut self.shared, now);
                 let on = |model: &&Arc<ModalModel>| (vertex as usize) < model.surface().positions().len();
                 if let (Some(user), Some(model), true) = (p.user(), model.filter(on), fits) {
                     let impulse = capped_impulse(model, impulse);
@@ -374,7 +381,7 @@ impl HostSession {
                 }
                 return;
             }
-            Ok(m) if p.message_budget.spend(now, 1.0) => m,
+            Ok(m) if p.budgets.messages.spend(now, 1.0) => m,
             _ => {
                 p.link.reject();
                 return self.drop_peer(peer, DisconnectReason::Protocol, true);
@@ -412,7 +419,7 @@ impl HostSession {
                     && !p.grabs.contains_key(&grab)
                     && model.is_some_and(|model| {
                         (vertex as usize) < model.surface().positions().len()
-                            && p.link.patches.spend(now, model, vertex, radius)
+                            && p.pays_for_patch(&mut self.shared, now, model, vertex, radius)
                     });
                 if fits {
                     p.grabs.insert(grab, AnnouncedGrab { body, input: None });
@@ -429,7 +436,7 @@ impl HostSession {
             }
             (GuestMessage::SnapshotRequest { body }, Some(_)) => {
                 let body = BodyId(body);
-                if p.streaming.contains(&body) && p.link.states.spend(now, 1.0) {
+                if p.streaming.contains(&body) && p.budgets.snapshots.spend(now, 1.0) {
                     self.send_snapshot(peer, body);
                 }
             }
@@ -516,6 +523,9 @@ impl HostSession {
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.standing = Standing::Joined(user);
         p.role = role;
+        if let Some(budgets) = self.away.take(user) {
+            p.budgets = budgets;
+        }
         p.link.received_at(now);
         let Newmark { h, beta, gamma } = self.config.newmark;
         let step_ns = (h * 1e9).round() as u64;
@@ -576,6 +586,7 @@ impl HostSession {
             for (grab, held) in &p.grabs {
                 self.event(HostEvent::GrabEnded { key: GrabKey { user, grab: *grab }, body: held.body });
             }
+            self.away.keep(user, p.budgets);
             for other in self.peers.values_mut().filter(|p| p.user().is_some()) {
                 other.send_message(&HostMessage::UserLeft { user: user.0, reason }, &mut self.out);
             }

@@ -4,24 +4,17 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::budgets::{GuestBudgets, SharedBudgets};
 use super::regulator::Regulator;
 use super::{DisconnectReason, Output};
-use crate::link::{Budget, Link, micros};
+use crate::link::{Link, micros};
 use crate::state::{BodyId, PeerId, Role, Tick, UserId, UserInfo};
-use crate::wire::{Clock, Datagram, HostMessage, MAX_BODIES, StreamSubscription};
+use crate::wire::{Clock, Datagram, HostMessage, StreamSubscription};
 
 /// Largest number of grabs of one guest.
 pub(crate) const MAX_GUEST_GRABS: usize = 16;
 /// Largest number of queued resends for one guest.
 const MAX_RESENDS: usize = 512;
-
-/// Largest number of impulses of one guest at once.
-pub(super) const IMPULSES_AT_ONCE: usize = 120;
-
-/// The budget of impulses of one guest, which guest and host both keep: 60 a second.
-pub(super) fn impulse_budget() -> Budget {
-    Budget::new(60.0, IMPULSES_AT_ONCE as f64)
-}
 
 /// Stage of a guest's join.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,16 +64,12 @@ pub(crate) struct GuestPeer {
     pub(crate) interest: BTreeMap<BodyId, u16>,
     pub(crate) grabs: BTreeMap<u16, AnnouncedGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
-    pub(crate) model_budget: Budget,
     /// Bytes of messages that the transport has accepted and not sent, as last reported.
     pub(crate) unsent: usize,
-    pub(crate) message_budget: Budget,
-    /// Budget of new targets of hands.
-    pub(crate) target_budget: Budget,
-    /// Budget for changes of interest.
-    pub(crate) interest_budget: Budget,
-    /// Budget of impulses.
-    pub(crate) impulse_budget: Budget,
+    /// What the guest may ask of the host. This outlives the connection.
+    pub(crate) budgets: GuestBudgets,
+    /// What is the guest's own of the budgets that all guests share.
+    pub(crate) share: SharedBudgets,
     pub(crate) regulator: Regulator,
 }
 
@@ -101,14 +90,9 @@ impl GuestPeer {
             interest: BTreeMap::new(),
             grabs: BTreeMap::new(),
             resends: VecDeque::new(),
-            model_budget: Budget::new(model_rate, 64.0 * 1024.0),
             unsent: 0,
-            message_budget: Budget::new(200.0, 400.0),
-            // All hands that a guest may have, each moved 240 times a second.
-            target_budget: Budget::new(MAX_GUEST_GRABS as f64 * 240.0, 1024.0),
-            // One for each of the most bodies that a session may have.
-            interest_budget: Budget::new(100.0, MAX_BODIES as f64),
-            impulse_budget: impulse_budget(),
+            budgets: GuestBudgets::new(model_rate),
+            share: SharedBudgets::of_one(now),
             regulator: Regulator::default(),
         }
     }

@@ -17,6 +17,7 @@
 //! stream in each direction, with the length of each message before the message as four bytes,
 //! little-endian. A message has at most [`MAX_MESSAGE`] bytes.
 
+mod budgets;
 mod disconnect_reason;
 mod download;
 mod guest;

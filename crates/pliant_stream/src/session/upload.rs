@@ -46,7 +46,7 @@ impl Upload {
     /// or has no transfer.
     pub(super) fn ready_at(&self, peer: &GuestPeer) -> Option<Duration> {
         let next = next_piece(peer)? as f64;
-        Some(peer.model_budget.ready_at(next).max(self.budget.ready_at(next)))
+        Some(peer.budgets.models.ready_at(next).max(self.budget.ready_at(next)))
     }
 }
 
@@ -92,13 +92,13 @@ impl HostSession {
             for id in turns {
                 let Some(p) = self.peers.get_mut(&id) else { continue };
                 let Some(bytes) = next_piece(p) else { continue };
-                if !p.model_budget.has(now, bytes as f64) {
+                if !p.budgets.models.has(now, bytes as f64) {
                     continue;
                 }
                 if !self.upload.budget.spend(now, bytes as f64) {
                     return;
                 }
-                p.model_budget.spend(now, bytes as f64);
+                p.budgets.models.spend(now, bytes as f64);
                 p.send_piece(bytes, &mut self.out);
                 self.upload.last = Some(id);
                 sent = true;

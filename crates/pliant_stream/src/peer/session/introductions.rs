@@ -58,10 +58,10 @@ impl PeerSession {
 
     pub(super) fn take_others(&mut self, now: Duration, peer: PeerId, others: Vec<(u16, String)>) {
         let Some(other) = self.others.get_mut(&peer).filter(|other| other.user.is_some()) else { return };
-        if other.told_at.is_some_and(|at| now.saturating_sub(at) < READ_EVERY) {
+        if other.announced_at.is_some_and(|at| now.saturating_sub(at) < READ_EVERY) {
             return other.link.reject();
         }
-        other.told_at = Some(now);
+        other.announced_at = Some(now);
         let others = others.into_iter().map(|(user, address)| (UserId(user), address));
         let others: Vec<_> =
             others.filter(|(user, _)| *user != UserId::HOST && !self.is_taken(*user)).collect();

@@ -160,7 +160,7 @@ impl PeerSession {
         for peer in wanting {
             let Some(other) = self.others.get_mut(&peer) else { continue };
             // A peer that asks too often waits.
-            if other.link.states.spend(now, 1.0) {
+            if other.budgets.states.spend(now, 1.0) {
                 other.wants_state = false;
                 state.iter().for_each(|part| self.message(peer, part));
             }

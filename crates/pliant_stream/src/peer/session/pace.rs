@@ -1,0 +1,52 @@
+//! How fast this peer steps, to stay with the others.
+
+use super::PeerSession;
+
+/// Largest share by which a peer's step is stretched or shortened to match the other peers' ticks.
+const SLEW: f64 = 0.01;
+/// Number of ticks behind all others from which on a peer catches up by steps of its own.
+pub(super) const BEHIND: u64 = 8;
+
+impl PeerSession {
+    /// By how many ticks every other peer is ahead of this one, and by how many behind, as far as
+    /// they have told.
+    pub(super) fn lead(&self) -> (u64, u64) {
+        let others = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
+        let both = others.map(|o| (o.newest.saturating_sub(self.tick), self.tick.saturating_sub(o.newest)));
+        both.reduce(|a, b| (a.0.min(b.0), a.1.min(b.1))).unwrap_or_default()
+    }
+
+    /// Steps up to `most` of the ticks that this peer has missed, if every other one is well ahead.
+    /// Then it was a stall. Returns the number of ticks.
+    pub(super) fn catch_up(&mut self, most: u64) -> u64 {
+        let (ahead, _) = self.lead();
+        self.catches_up = ahead > if self.catches_up { 0 } else { BEHIND };
+        if !self.catches_up {
+            return 0;
+        }
+        let ticks = most.min(ahead).min(self.missed);
+        (0..ticks).for_each(|_| self.step());
+        self.missed -= ticks;
+        self.hurried += ticks;
+        for ahead in self.others.values_mut().filter_map(|o| o.ahead.as_mut()) {
+            *ahead += ticks as f64;
+        }
+        ticks
+    }
+
+    /// Share by which a step is longer than `step`, to stay with the other peers; positive when
+    /// this peer is ahead.
+    ///
+    /// Each side sees the other late by the one-way delay. With `d` the true lead and `w` the
+    /// one-way delay in ticks, this side sees `d + w` and the other `w - d`, so half the difference
+    /// is `d`.
+    pub(super) fn drift(&self) -> f64 {
+        let leads: Vec<f64> =
+            self.others.values().filter_map(|o| Some(0.5 * (o.ahead? - o.theirs?))).collect();
+        if leads.is_empty() {
+            return 0.0;
+        }
+        let mean = leads.iter().sum::<f64>() / leads.len() as f64;
+        (0.01 * mean).clamp(-SLEW, SLEW)
+    }
+}
