@@ -67,7 +67,9 @@ pub struct BodyArrived {
 }
 
 /// The host has removed a body from the session. An entity that the plugin spawned for the body is
-/// despawned. An entity of the app stays, in the state in which it was last displayed.
+/// despawned. An entity of the app stays, in the state in which it was last displayed, until the
+/// app leaves the session
+/// ([`SessionCommands::leave_session`](crate::SessionCommands::leave_session)).
 #[derive(Message, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct BodyLeft {

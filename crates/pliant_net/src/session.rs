@@ -8,7 +8,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use bevy::prelude::*;
-use pliant_body::{BodyState, Driven, VisualState};
+use pliant_body::{BodyState, Driven, FixedObstacles, VisualState};
+use pliant_modal::{Body, Frame, State, StepError};
 use pliant_stream::{DisconnectReason, UserId};
 
 use crate::guest::{self, GuestState, JoinConfig, NetGuest};
@@ -339,7 +340,11 @@ fn take_requests(world: &mut World) {
     });
     for request in requests.unwrap_or_default() {
         leave(world);
-        publish_events(world);
+        // Without an event nobody looks yet, and what begins now has the next state.
+        let over = world.get_resource::<SessionControl>().is_some_and(|control| !control.events.is_empty());
+        if over {
+            report(world);
+        }
         // An observer that leaves a session when it is over means the one that was left here, and
         // not the one that begins now.
         if let Some(mut control) = world.get_resource_mut::<SessionControl>() {
@@ -440,23 +445,29 @@ fn close_apart(world: &mut World, session: impl Send + 'static) {
 }
 
 /// Gives a body that a session has displayed back to the app, which steps it on from the shape that
-/// was last displayed.
+/// was last displayed, and from rest.
 pub(crate) fn give_back(world: &mut World, entity: Entity) {
     let Ok(mut entity) = world.get_entity_mut(entity) else { return };
-    entity.remove::<(RemoteBody, RemoteHands)>();
+    entity.remove::<(RemoteBody, RemoteHands, FixedObstacles)>();
     entity.insert(Driven::Local);
     let shown = entity.get::<VisualState>().map(|visual| visual.q().to_vec());
     let (Some(shown), Some(mut state)) = (shown, entity.get_mut::<BodyState>()) else { return };
-    let mut from = state.body().state().clone();
-    if from.q.len() != shown.len() {
-        return;
+    let set = at_rest(state.body(), shown).and_then(|rest| state.body_mut().set_state(&rest));
+    if let Err(error) = set {
+        debug!("a body goes on as it was before the session: {error}");
     }
-    from.v.fill(0.0);
-    from.a.fill(0.0);
-    from.q = shown;
-    if let Err(error) = state.body_mut().set_state(&from) {
-        debug!("a body goes on from rest: {error}");
-    }
+}
+
+/// Returns the state of a body that has had the shape `shown` for long. The session has moved the
+/// entity, and the next tick takes the pose over from there. All else that the body has of its own
+/// is from before the session.
+fn at_rest(body: &Body, shown: Vec<f64>) -> Result<State, StepError> {
+    let (before, frame) = (body.state(), body.frame());
+    let viscous = !before.z.is_empty();
+    let frame = Frame::from_motion(body.model(), frame.center(), frame.orientation(), [0.0; 3], [0.0; 3])?;
+    let zero = State::zero(shown.len(), viscous);
+    let z = if viscous { shown.clone() } else { Vec::new() };
+    Ok(State { q: shown, z, s: vec![0.0; before.s.len()], frame, ..zero })
 }
 
 /// Keeps what is told of the session until no session is taken out of the world.

@@ -9,10 +9,11 @@ use std::time::{Duration, Instant};
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Driven, Grab, GrabOf, ModalAsset, ModalBody, VisualState};
+use pliant_body::{BodyState, Driven, FixedObstacles, Grab, GrabOf, ModalAsset, ModalBody, VisualState};
+use pliant_modal::{Frame, ModalModel, Relaxation, StepSettings};
 use pliant_net::transport::{Limits, TransportError};
 use pliant_net::{
-    DisconnectReason, Emulation, Fingerprint, HandOf, HostConfig, HostOptions, Invite, JoinConfig,
+    BodyLeft, DisconnectReason, Emulation, Fingerprint, HandOf, HostConfig, HostOptions, Invite, JoinConfig,
     JoinOptions, NetError, NetHost, NetPlugin, NetStats, PeerConfig, RemoteBody, RemoteHands, SessionClosed,
     SessionCommands, SessionFailed, SessionJoined, SessionState, SharedBody, User, UserLeft,
 };
@@ -314,11 +315,12 @@ fn a_peer_leaves_its_body_goes_on_and_it_may_come_back() {
     let _alone = alone();
     let (mut one, mut two) = (idle(), idle());
     let (mine, yours) = (share(&mut one), share(&mut two));
-    one.world_mut().commands().join_peers(PeerConfig::default());
+    let from_afar = |seed| HostOptions { emulation: far(seed), ..HostOptions::default() };
+    one.world_mut().commands().join_peers(PeerConfig { transport: from_afar(1), ..PeerConfig::default() });
     let invite = run_until(&mut [&mut one], "the first is there", |apps| {
         apps[0].world().get_resource::<pliant_net::NetPeer>().map(pliant_net::NetPeer::invite)
     });
-    let join = || PeerConfig { join: Some(invite.clone()), ..PeerConfig::default() };
+    let join = || PeerConfig { join: Some(invite.clone()), transport: from_afar(2), ..PeerConfig::default() };
     two.world_mut().commands().join_peers(join());
     let together = |apps: &mut [&mut App]| users(apps[0]) == 2 && users(apps[1]) == 2;
     run_until(&mut [&mut one, &mut two], "they are together", together);
@@ -338,6 +340,104 @@ fn a_peer_leaves_its_body_goes_on_and_it_may_come_back() {
     two.world_mut().commands().join_peers(join());
     run_timed(&mut [&mut one, &mut two], &mut longest, "they are together again", together);
     println!("the longest frame took {:.1} ms", longest.as_secs_f64() * 1e3);
+    assert!(longest < ROUND_TRIP / 3, "a frame took {longest:?}");
+}
+
+#[test]
+fn a_free_body_that_flew_before_the_session_is_at_rest_after_it() {
+    let _alone = alone();
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let jack = Arc::new(ModalModel::read(jack).unwrap());
+    let mut app = idle();
+    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(jack.clone()));
+    let relaxation = Some(Relaxation { ratio: 0.5, time: 10.0 });
+    let settings = StepSettings { relaxation, ..StepSettings::default() };
+    let body = ModalBody { settings, ..ModalBody::new(handle) };
+    let entity = app.world_mut().spawn((body, SharedBody::named("jack"))).id();
+    run_until(&mut [&mut app], "it is there", |apps| {
+        apps[0].world().get::<BodyState>(entity).is_some_and(BodyState::has_place)
+    });
+    let mut state = app.world_mut().get_mut::<BodyState>(entity).unwrap();
+    let mut flies = state.body().state().clone();
+    let (center, upright) = (flies.frame.center(), flies.frame.orientation());
+    flies.frame = Frame::from_motion(&jack, center, upright, [0.0, -5.0, 0.0], [0.0, 0.1, 0.0]).unwrap();
+    // It was bent for long.
+    flies.z.fill(0.01);
+    state.body_mut().set_state(&flies).unwrap();
+
+    app.world_mut().commands().join_peers(PeerConfig::default());
+    run_until(&mut [&mut app], "it is played", |apps| {
+        apps[0].world().get::<Driven>(entity) == Some(&Driven::Remote)
+    });
+    run_frames(&mut [&mut app], 30);
+    assert!(app.world().get::<FixedObstacles>(entity).is_some());
+    app.world_mut().commands().leave_session();
+    app.update();
+    let shown = app.world().get::<Transform>(entity).unwrap().translation;
+    run_frames(&mut [&mut app], 30);
+    let world = app.world();
+    assert_eq!(world.get::<Driven>(entity), Some(&Driven::Local));
+    assert!(world.get::<FixedObstacles>(entity).is_none(), "nobody asks for them any more");
+    let body = world.get::<BodyState>(entity).unwrap().body();
+    let frame = body.frame();
+    assert_eq!([frame.velocity(), frame.spin()], [[0.0; 3]; 2]);
+    assert!(body.q().iter().chain(body.z()).all(|x| *x == 0.0), "{:?}, {:?}", body.q(), body.z());
+    assert_eq!(world.get::<Transform>(entity).unwrap().translation, shown);
+}
+
+#[test]
+fn a_body_that_the_host_has_removed_is_the_guests_again_when_it_leaves() {
+    let _alone = alone();
+    let (mut host, mut guest) = (idle(), idle());
+    let own = share(&mut guest);
+    guest.world_mut().get_mut::<ModalBody>(own).unwrap().settings.damping_scale = 3.0;
+    let before = guest.world().get::<ModalBody>(own).unwrap().clone();
+    host.world_mut().commands().host_session(HostConfig::default());
+    let invite = run_until(&mut [&mut host], "the session is open", |apps| invite_of(apps[0]));
+    guest.world_mut().commands().join_session(invite, JoinConfig::default());
+    // The host removes it, brings it back, and removes it again.
+    for times in 1..=2 {
+        let body = share(&mut host);
+        run_until(&mut [&mut host, &mut guest], "it is the host's", |apps| {
+            apps[1].world().get::<RemoteBody>(own).is_some()
+        });
+        host.world_mut().despawn(body);
+        run_until(&mut [&mut host, &mut guest], "it is removed", |apps| {
+            messages::<BodyLeft>(apps[1]).len() == times
+        });
+        let world = guest.world();
+        assert!(world.get::<RemoteBody>(own).is_none(), "it tracks nothing");
+        assert_eq!(world.get::<Driven>(own), Some(&Driven::Remote), "it stays as it was last shown");
+    }
+    guest.world_mut().commands().leave_session();
+    guest.update();
+    let world = guest.world();
+    assert_eq!(world.get::<Driven>(own), Some(&Driven::Local));
+    assert_eq!(world.get::<ModalBody>(own), Some(&before));
+    assert_eq!(messages::<BodyLeft>(&guest).len(), 2, "of which nobody is told again");
+}
+
+#[test]
+fn who_is_told_that_a_session_is_over_reads_that_there_is_none() {
+    #[derive(Resource, Default)]
+    struct Seen(Vec<SessionState>);
+    let _alone = alone();
+    let mut app = idle();
+    app.init_resource::<Seen>();
+    app.add_observer(|_: On<SessionClosed>, state: Res<SessionState>, mut seen: ResMut<Seen>| {
+        seen.0.push(*state);
+    });
+    run_frames(&mut [&mut app], 2);
+    app.world_mut().commands().host_session(HostConfig::default());
+    run_until(&mut [&mut app], "it hosts", |apps| state(apps[0]) == SessionState::Hosting);
+    // The next session begins in the frame in which this one is left.
+    app.world_mut().commands().host_session(HostConfig::default());
+    run_until(&mut [&mut app], "it hosts again", |apps| {
+        messages::<SessionJoined>(apps[0]).len() == 2 && state(apps[0]) == SessionState::Hosting
+    });
+    app.world_mut().commands().leave_session();
+    app.update();
+    assert_eq!(app.world().resource::<Seen>().0, [SessionState::Idle; 2]);
 }
 
 /// With the feature `states`, the state is one of Bevy's.

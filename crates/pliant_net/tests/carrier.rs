@@ -543,6 +543,22 @@ fn no_more_than_the_longest_message_waits_for_an_app_that_does_not_read() {
 }
 
 #[test]
+fn a_long_state_may_come_at_once_also_on_a_connection_that_another_peer_has_opened() {
+    let (server, _, _) = ports();
+    let mesh = server.mesh(Limits::host());
+    server.receive(CLIENT, Channel::Message, raw(0, 1, &[]));
+    // A state comes in messages of at most 256 KiB, and a netcode that stood still delivers them
+    // between two frames.
+    for _ in 0..20 {
+        server.receive(CLIENT, Channel::Message, raw(2, 1, &[0; 250_000]));
+    }
+    while server.poll().is_some() {}
+    let came = drained(&mesh);
+    let count = came.iter().filter(|event| matches!(event, Event::Message { .. })).count();
+    assert_eq!((count, came.len()), (20, 21), "{:?}", came.last());
+}
+
+#[test]
 fn a_call_of_one_who_is_there_ends_and_the_connection_stays() {
     let mut network = Network::with_delay(Duration::from_millis(100));
     let [server, client] = [b"server".as_slice(), b"client"].map(Fingerprint::of_name);
@@ -678,24 +694,31 @@ fn a_message_in_parts_is_no_longer_than_the_longest() {
 }
 
 #[test]
-fn what_a_closing_connection_has_queued_keeps_its_goodbye_for_a_second_at_most() {
-    let (server, client, carry) = ports();
-    let host = server.host(Limits::host());
-    let rate = RateCap::from_mbit_per_s(0.1);
-    let guest = client.join(SERVER, Limits { rate, ..Limits::guest() });
-    carry();
-    drained(&host);
-    // 32 s at this rate.
-    (0..4).for_each(|_| guest.send_message(PeerId::HOST, Bytes::from(vec![0; 100_000])).unwrap());
-    let begin = Instant::now();
-    guest.end();
-    let reason = wait_for("the goodbye arrives", || {
+fn what_a_closing_connection_has_queued_keeps_its_goodbye_for_a_second() {
+    // A busy machine is late now and then, so the test waits for a round in which it is not.
+    wait_for("a goodbye in time", || {
+        let (server, client, carry) = ports();
+        let host = server.host(Limits::host());
+        let rate = RateCap::from_mbit_per_s(0.1);
+        let guest = client.join(SERVER, Limits { rate, ..Limits::guest() });
         carry();
-        assert!(begin.elapsed() < Duration::from_secs(16), "no goodbye within 16 s");
-        closed(&host)
+        drained(&host);
+        // 32 s at this rate.
+        (0..4).for_each(|_| guest.send_message(PeerId::HOST, Bytes::from(vec![0; 100_000])).unwrap());
+        let begin = Instant::now();
+        guest.end();
+        let reason = wait_for("the goodbye arrives", || {
+            carry();
+            closed(&host)
+        });
+        let took = begin.elapsed().as_secs_f64();
+        println!("the goodbye arrives after {took:.2} s");
+        assert_eq!(reason, DisconnectReason::Left);
+        assert!(took > 0.99, "what is queued has its second: {took} s");
+        // The last part of it that was sent takes 0.16 s at this rate.
+        must!(took < 1.5, "{took} s");
+        Ok(())
     });
-    println!("the goodbye arrives after {:?}", begin.elapsed());
-    assert_eq!(reason, DisconnectReason::Left);
 }
 
 #[test]

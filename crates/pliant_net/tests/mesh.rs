@@ -323,6 +323,14 @@ fn call(app: &mut App, caller: &mut UnauthenticatedPeer, hello: &Bytes) {
     });
 }
 
+/// The token that a peer has been told for when it comes back.
+fn told_token(caller: &UnauthenticatedPeer) -> Option<Token> {
+    caller.messages.iter().find_map(|bytes| match PeerMessage::decode(bytes) {
+        Ok(PeerMessage::Hello { address, .. }) => address.parse::<Invite>().ok()?.token,
+        _ => None,
+    })
+}
+
 fn with_key(invite: &Invite, key: &[u8]) -> UnauthenticatedPeer {
     let identity = Some(Identity::from_pkcs8(key).unwrap());
     let endpoint = Endpoint::join(invite, JoinOptions { identity, ..JoinOptions::default() }).unwrap();
@@ -392,12 +400,6 @@ fn each_peer_has_a_token_of_its_own() {
     let token = Token([1; 16]);
     let (mut a, invite) = first(Access::Tokens(vec![Grant::hold(token)]), limits());
     let hello = hello(&a, 0, &invite);
-    let told = |caller: &UnauthenticatedPeer| {
-        caller.messages.iter().find_map(|bytes| match PeerMessage::decode(bytes) {
-            Ok(PeerMessage::Hello { address, .. }) => address.parse::<Invite>().ok()?.token,
-            _ => None,
-        })
-    };
     let mut callers: Vec<UnauthenticatedPeer> = (0..2)
         .map(|_| {
             let mut caller = UnauthenticatedPeer::at(&invite);
@@ -405,7 +407,7 @@ fn each_peer_has_a_token_of_its_own() {
             caller
         })
         .collect();
-    let tokens: Vec<Token> = callers.iter().map(|caller| told(caller).expect("a token")).collect();
+    let tokens: Vec<Token> = callers.iter().map(|caller| told_token(caller).expect("a token")).collect();
     assert!(tokens[0] != tokens[1] && !tokens.contains(&token), "each of the three is another one");
     // With its token, a peer comes back. The token of one that was sent away admits nobody.
     let second = callers.pop().unwrap();
@@ -425,4 +427,73 @@ fn each_peer_has_a_token_of_its_own() {
         wrong.closed.is_some() && right.connected
     });
     assert_eq!((wrong.closed, right.closed), (Some(DisconnectReason::UnknownToken), None));
+}
+
+#[test]
+fn a_second_call_that_is_refused_does_not_cost_a_peer_its_token() {
+    let _alone = alone();
+    let (mut a, invite) = first(Access::Tokens(vec![Grant::hold(Token([1; 16]))]), limits());
+    let key = Identity::generate().unwrap().to_pkcs8();
+    let mut one = with_key(&invite, &key);
+    let asks = hello(&a, 0, &invite);
+    call(&mut a, &mut one, &asks);
+    let own = invite.clone().with_token(told_token(&one).expect("a token"));
+    // Others have told it of two addresses at which this peer is, and it calls both.
+    let as_two = hello(&a, 2, &invite);
+    let mut two = with_key(&own, &key);
+    call(&mut a, &mut two, &as_two);
+    run_until(&mut [&mut a], "one of the calls is refused", |_| {
+        two.listen();
+        two.closed.is_some()
+    });
+    assert_eq!((two.closed, users(&mut a)), (Some(DisconnectReason::NumberTaken), 2));
+    drop((one, two));
+    run_until(&mut [&mut a], "it is away", |apps| users(apps[0]) == 1);
+    let mut back = with_key(&own, &key);
+    call(&mut a, &mut back, &as_two);
+    assert_eq!((back.closed, users(&mut a)), (None, 2));
+}
+
+#[test]
+fn nobody_who_is_there_is_looked_for_as_somebody_else() {
+    let _alone = alone();
+    let door = Endpoint::host(HostOptions::default()).unwrap();
+    let mut app = peer("told", Some(door.invite()), Access::Anyone, limits());
+    let asks = run_until(&mut [&mut app], "it asks to come in", |_| asking(&door));
+    admit(&app, &door, asks, 100, Vec::new());
+    run_until(&mut [&mut app], "it is in", |apps| users(apps[0]) == 2);
+    let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let nobody = Invite::new(silent.local_addr().unwrap(), Fingerprint([7; 32]));
+    let others = vec![(7, door.invite().to_string()), (8, nobody.to_string())];
+    door.send_message(asks, PeerMessage::Others { others }.encode().into()).unwrap();
+    let looked_for = |app: &App| app.world().resource::<NetPeer>().looked_for();
+    run_until(&mut [&mut app], "it looks for somebody", |apps| looked_for(apps[0]) > 0);
+    assert_eq!(looked_for(&app), 1, "one of the two has the key of the teller");
+}
+
+#[test]
+fn of_one_who_comes_back_the_others_are_told_again() {
+    let _alone = alone();
+    let (mut a, invite) = first(Access::Anyone, limits());
+    let asks = hello(&a, 0, &invite);
+    let mut stays = UnauthenticatedPeer::at(&invite);
+    call(&mut a, &mut stays, &asks);
+    run_until(&mut [&mut a], "the second is in", |apps| users(apps[0]) == 2);
+    let key = Identity::generate().unwrap().to_pkcs8();
+    for times in 1..=2 {
+        let mut goes = with_key(&invite, &key);
+        call(&mut a, &mut goes, &asks);
+        run_until(&mut [&mut a], "the second is told of the third", |_| {
+            stays.listen();
+            let told = |bytes: &&Bytes| match PeerMessage::decode(bytes) {
+                Ok(PeerMessage::Others { others }) => others.iter().any(|(user, _)| *user == 3),
+                _ => false,
+            };
+            let told = stays.messages.iter().filter(told).count();
+            must!(told == times, "told {told} times, and it has come {times} times");
+            Ok(())
+        });
+        drop(goes);
+        run_until(&mut [&mut a], "the third has left", |apps| users(apps[0]) == 2);
+    }
 }

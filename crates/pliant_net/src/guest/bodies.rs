@@ -68,14 +68,10 @@ impl NetGuest {
                 let waiting =
                     waiting.iter(world).find(|(_, shared)| shared.name == name).map(|(entity, _)| entity);
                 match waiting {
-                    Some(entity) => {
-                        // The entity may have tracked a body of the lost session.
-                        let orphan = self.orphans.iter().position(|orphan| orphan.entity == entity);
-                        match orphan.map(|index| self.orphans.swap_remove(index)) {
-                            Some(orphan) => (entity, orphan.made_here, orphan.before),
-                            None => (entity, false, world.get::<ModalBody>(entity).cloned()),
-                        }
-                    }
+                    Some(entity) => match self.known(world, entity) {
+                        Some(known) => (entity, known.made_here, known.before),
+                        None => (entity, false, world.get::<ModalBody>(entity).cloned()),
+                    },
                     None => {
                         let transform = transform_of(placement.unwrap_or_default());
                         (world.spawn((SharedBody::named(name.clone()), transform)).id(), true, None)
@@ -113,6 +109,21 @@ impl NetGuest {
         world.write_message(BodyArrived { entity, name });
     }
 
+    /// Takes what is known of an entity that has tracked a body of the lost session, or one that
+    /// the host has removed.
+    fn known(&mut self, world: &World, entity: Entity) -> Option<FollowedBody> {
+        self.forget_what_the_app_has(world);
+        [&mut self.orphans, &mut self.removed].into_iter().find_map(|bodies| {
+            let at = bodies.iter().position(|followed| followed.entity == entity)?;
+            Some(bodies.swap_remove(at))
+        })
+    }
+
+    /// Forgets the entities of removed bodies that are gone, or that the app steps itself.
+    fn forget_what_the_app_has(&mut self, world: &World) {
+        self.removed.retain(|followed| world.get(followed.entity) == Some(&Driven::Remote));
+    }
+
     /// Takes over changed settings from the host, because the energy and the knobs that are
     /// displayed here use the same settings.
     pub(super) fn body_changed(&mut self, world: &mut World, id: BodyId) {
@@ -129,7 +140,7 @@ impl NetGuest {
         self.less_since.remove(&id);
         let Some(followed) = self.bodies.remove(&id) else { return };
         self.grabs.retain(|_, sent| sent.own.body != id);
-        Self::take_leave(world, followed);
+        self.take_leave(world, followed);
     }
 
     /// Stops all bodies when the session is lost.
@@ -146,42 +157,41 @@ impl NetGuest {
     /// Removes the bodies that the session does not have after a reconnect.
     pub(super) fn forget_orphans(&mut self, world: &mut World) {
         for followed in std::mem::take(&mut self.orphans) {
-            Self::take_leave(world, followed);
+            self.take_leave(world, followed);
         }
     }
 
     /// Gives all bodies back to the app, which leaves the session. Entities that this plugin has
     /// spawned are despawned.
     pub(super) fn give_back_bodies(&mut self, world: &mut World) {
+        self.forget_what_the_app_has(world);
         self.orphan_bodies(world);
-        for mut followed in std::mem::take(&mut self.orphans) {
-            let (entity, before) = (followed.entity, followed.before.take());
-            if !followed.made_here {
-                match before {
-                    Some(before) => {
-                        if let Ok(mut entity) = world.get_entity_mut(entity) {
-                            entity.insert(before);
-                        }
-                        give_back(world, entity);
-                    }
-                    None => {
-                        if let Ok(mut entity) = world.get_entity_mut(entity) {
-                            entity.remove::<(ModalBody, Driven)>();
-                        }
-                    }
+        self.forget_orphans(world);
+        for followed in std::mem::take(&mut self.removed) {
+            let Ok(mut entity) = world.get_entity_mut(followed.entity) else { continue };
+            match followed.before {
+                Some(before) => {
+                    entity.insert(before);
+                    give_back(world, followed.entity);
+                }
+                None => {
+                    entity.remove::<(ModalBody, Driven)>();
                 }
             }
-            Self::take_leave(world, followed);
         }
     }
 
-    fn take_leave(world: &mut World, followed: FollowedBody) {
+    /// Ends the tracking of a body. An entity of the app shows its last state until the app leaves
+    /// the session, and has then what it had before.
+    fn take_leave(&mut self, world: &mut World, followed: FollowedBody) {
+        let (entity, name) = (followed.entity, followed.name.clone());
         if followed.made_here {
-            world.try_despawn(followed.entity).ok();
-        } else if let Ok(mut entity) = world.get_entity_mut(followed.entity) {
-            entity.remove::<(RemoteBody, RemoteHands)>();
+            world.try_despawn(entity).ok();
+        } else if let Ok(mut there) = world.get_entity_mut(entity) {
+            there.remove::<(RemoteBody, RemoteHands)>();
+            self.removed.push(followed);
         }
-        world.write_message(BodyLeft { entity: followed.entity, name: followed.name });
+        world.write_message(BodyLeft { entity, name });
     }
 }
 

@@ -124,6 +124,8 @@ pub struct NetGuest {
     bodies: BTreeMap<BodyId, FollowedBody>,
     /// Bodies of a lost session, which the next session may have again.
     orphans: Vec<FollowedBody>,
+    /// Bodies that the host has removed, on entities of the app, for when the app leaves.
+    removed: Vec<FollowedBody>,
     users: Roster,
     grabs: BTreeMap<Entity, SentGrab>,
     /// Impulses of this frame that the session did not take.
@@ -161,6 +163,7 @@ impl NetGuest {
             session: None,
             bodies: BTreeMap::new(),
             orphans: Vec::new(),
+            removed: Vec::new(),
             users: Roster::default(),
             grabs: BTreeMap::new(),
             refused_impulses: Vec::new(),

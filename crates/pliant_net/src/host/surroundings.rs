@@ -49,6 +49,7 @@ impl KnownSurroundings {
         let known = &mut self.around.obstacles;
         self.waits = near.iter().any(|o| !known.contains(o));
         if self.waits && self.added.is_none_or(|added| now.saturating_sub(added) >= ADD_EVERY) {
+            let before = known.clone();
             for obstacle in near {
                 if !known.contains(&obstacle) {
                     known.push(obstacle);
@@ -59,7 +60,14 @@ impl KnownSurroundings {
                 known.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
                 known.truncate(Surroundings::MAX_OBSTACLES);
             }
-            (self.waits, self.added, changed) = (false, Some(now), true);
+            // Where there is no room for all, a new one may be too far away, and the same ones in
+            // another order are nothing new.
+            if known.iter().all(|o| before.contains(o)) {
+                *known = before;
+            } else {
+                changed = true;
+            }
+            (self.waits, self.added) = (false, Some(now));
         }
         changed.then_some(&self.around)
     }
@@ -130,5 +138,31 @@ mod tests {
         assert_eq!(around.obstacles.len(), 256);
         assert!(around.obstacles.iter().all(|o| o.position[0] < 256.5));
         assert!(known.look(Duration::from_secs(1), &body).is_none());
+    }
+
+    #[test]
+    fn the_nearest_256_in_another_order_restart_no_streams() {
+        let (mut body, mut known) = (body(), KnownSurroundings::default());
+        let fixed: Vec<_> = (0..1000).map(|k| ball(f64::from(k - 500))).collect();
+        let mut restarts = Vec::new();
+        for tick in 0..400_u32 {
+            // Something that moves is another obstacle in each tick, and the body sways between
+            // two of those that stand still, so that now the one and now the other is nearer.
+            let x = f64::from(tick % 5) * 0.2 + 0.1;
+            body.set_pose([x, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]).unwrap();
+            let moves = Moving {
+                shape: Sphere { center: [0.0; 3], radius: 0.1 },
+                position: [0.0, 9.0, 0.0],
+                rotation: [0.0, 0.0, 0.0, 1.0],
+                velocity: [0.1, 0.0, 0.0],
+                angular_velocity: [0.0; 3],
+            };
+            let mut all = fixed.clone();
+            all.push(Arc::new(moves));
+            body.set_obstacles(all).unwrap();
+            let at = Duration::from_millis(10) * tick;
+            restarts.extend(known.look(at, &body).map(|around| (tick, around.obstacles.len())));
+        }
+        assert_eq!(restarts, [(0, 256)], "in four seconds");
     }
 }

@@ -31,7 +31,7 @@ pub(super) struct ConnectedPeer {
     /// When the peer connected.
     since: Duration,
     /// Whether this peer has closed the connection. Data that still arrives is ignored.
-    sent_away: bool,
+    pub(super) sent_away: bool,
 }
 
 impl ConnectedPeer {
@@ -178,11 +178,15 @@ impl NetPeer {
         self.known.see(key, user, |key| here.contains(key));
     }
 
+    /// Whether the peer at a connection is in the session.
+    pub(super) fn is_in(&self, peer: PeerId) -> bool {
+        self.session.as_ref().is_some_and(|session| session.user_of(peer).is_some())
+    }
+
     /// The peers that are in the session with this one, and where they are reached.
     pub(super) fn reachable(&self) -> Vec<(UserId, String)> {
         // Who answers at an address that was told of is nobody before its hello.
-        let Some(session) = &self.session else { return Vec::new() };
-        let here = self.others.iter().filter(|(peer, _)| session.user_of(**peer).is_some());
+        let here = self.others.iter().filter(|(peer, _)| self.is_in(**peer));
         here.filter_map(|(_, other)| Some((other.number?, other.invite.as_ref()?.to_string()))).collect()
     }
 
@@ -280,10 +284,7 @@ impl NetPeer {
         debug!("peer {peer} is sent away: {reason}");
         if let Some(other) = self.others.get_mut(&peer) {
             (other.sent_away, other.first) = (true, None);
-            let key = other.key;
-            if !may_come_back(reason) {
-                self.take_token(&key);
-            }
+            self.bar(peer, reason);
         }
         self.carrier.close(peer, reason);
         if let Some(session) = &mut self.session {
@@ -350,12 +351,14 @@ impl NetPeer {
                         self.carrier.close(peer, reason);
                         if let Some(other) = self.others.get_mut(&peer) {
                             (other.number, other.invite, other.sent_away) = (None, None, true);
-                            let key = other.key;
-                            if !may_come_back(reason) && reason != DisconnectReason::Left {
-                                self.take_token(&key);
+                            if reason != DisconnectReason::Left {
+                                self.bar(peer, reason);
                             }
                         }
                     }
+                    // Whoever comes back is then somebody new, of whom all are told: another peer
+                    // may have given up looking.
+                    self.introduce();
                 }
                 PeerEvent::TurnedAway { peer, reason } => {
                     // The session's goodbye is more precise than the end of the connection, so it

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::{BodyState, FixedObstacles, Grab, GrabForce, GrabOf, Impulse};
-use pliant_modal::{Body, FixedObstacle, FixedShape, ModalModel};
+use pliant_modal::{Body, FixedObstacle, FixedShape, ModalModel, ObstacleShape};
 use pliant_stream::peer::PeerSession;
 use pliant_stream::{BodyId, GrabKey, StepSettings, StreamError, Surroundings};
 
@@ -50,7 +50,8 @@ pub(super) fn agreed_settings(body: &Body) -> StepSettings {
 /// Returns the surroundings with which all peers step this body: what stands still around it, in an
 /// order and with numbers that are the same on all machines.
 ///
-/// More than [`Surroundings::MAX_OBSTACLES`] obstacles count as none.
+/// More than [`Surroundings::MAX_OBSTACLES`] obstacles count as none, and so does each that no
+/// machine would accept, which is decided by the agreed numbers.
 pub(super) fn agreed_surroundings(told: &FixedObstacles) -> Surroundings {
     /// Resolution of lengths, m, and of quaternions: a power of two, so that rounding is exact.
     const FINE: f64 = 1.0 / 1_048_576.0;
@@ -73,7 +74,8 @@ pub(super) fn agreed_surroundings(told: &FixedObstacles) -> Surroundings {
         let (position, rotation) = (of.position.map(round), rotation.map(|x| sign * x + 0.0));
         FixedObstacle { shape, position, rotation }
     };
-    let mut obstacles: Vec<FixedObstacle> = told.obstacles.iter().map(agreed).collect();
+    let obstacles = told.obstacles.iter().map(agreed);
+    let mut obstacles: Vec<FixedObstacle> = obstacles.filter(|o| o.check().is_ok()).collect();
     if obstacles.len() > Surroundings::MAX_OBSTACLES {
         warn!("a body of peers touches nothing: it has {} obstacles", obstacles.len());
         obstacles.clear();
@@ -171,4 +173,23 @@ pub(crate) fn show(
         }
     }
     net.flush();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_obstacle_beyond_all_bounds_does_not_cost_the_session() {
+        let ball = |x: f64, radius: f64| FixedObstacle {
+            shape: FixedShape::Ball { radius },
+            position: [x, 0.0, 0.0],
+            rotation: [0.0, 0.0, 0.0, 1.0],
+        };
+        // The last one lies within the bounds as soon as it is rounded.
+        let obstacles = vec![ball(2e6, 1.0), ball(1.0, 0.5), ball(3.0, -0.5), ball(1e6 + 1e-9, 0.5)];
+        let around = agreed_surroundings(&FixedObstacles { obstacles, ..FixedObstacles::default() });
+        assert_eq!(around.obstacles, [ball(1.0, 0.5), ball(1e6, 0.5)]);
+        assert!(around.check().is_ok(), "{:?}", around.check());
+    }
 }

@@ -1,5 +1,6 @@
 //! Reconnects peers that have lost each other.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use pliant_stream::{DisconnectReason, PeerId, UserId};
@@ -7,7 +8,7 @@ use tracing::debug;
 
 use super::missed::Missed;
 use super::{NetPeer, PeerState};
-use crate::transport::Invite;
+use crate::transport::{Fingerprint, Invite};
 
 /// Returns whether a connection that ended for this reason is opened again: the peers have lost
 /// each other, or there was no room, and neither has sent the other away.
@@ -34,10 +35,13 @@ impl NetPeer {
         let PeerState::In { user: own } = self.state else { return };
         let Some(teller) = self.others.get(&peer).and_then(|other| other.number) else { return };
         let now = self.now();
+        let here = self.others.iter().filter(|(peer, _)| self.is_in(**peer));
+        let keys: BTreeSet<Fingerprint> = here.map(|(_, other)| other.key).collect();
         for (number, address) in others {
-            // A connection to the address of a liar says nothing: who is in the session is known.
-            let is_here = self.users.get(number).is_some();
             let Ok(invite) = address.parse::<Invite>() else { continue };
+            // A connection to the address of a liar says nothing: who is in the session is known.
+            // Nor is one who is there called as somebody else.
+            let is_here = self.users.get(number).is_some() || keys.contains(&invite.fingerprint);
             if number < own && number != UserId::HOST && !is_here && !self.refused.contains(&number) {
                 self.missed.tell(now, teller, number, invite);
             }

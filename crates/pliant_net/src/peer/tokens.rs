@@ -1,10 +1,11 @@
 //! The tokens that a peer gives to the others.
 
-use pliant_stream::PeerId;
+use pliant_stream::{DisconnectReason, PeerId};
 use tracing::warn;
 
 use super::NetPeer;
-use crate::transport::{Access, Fingerprint, Grant, Invite, Token};
+use super::reconnect::may_come_back;
+use crate::transport::{Access, Grant, Invite, Token, has_called};
 
 /// Most tokens that are valid at one time beside the application's.
 const MAX_TOKENS: usize = 4096;
@@ -37,9 +38,18 @@ impl NetPeer {
         }
     }
 
-    /// Makes the token of a peer that was sent away invalid.
-    pub(super) fn take_token(&mut self, key: &Fingerprint) {
-        if self.tokens.remove(key).is_some() {
+    /// Makes the token of a peer that is sent away for good invalid. A peer that is in the session
+    /// by another connection needs it to come back: of two calls of an honest peer at once, one is
+    /// refused, and so is one to which a false introduction has led. The refusal may arrive before
+    /// the answer to the other call.
+    pub(super) fn bar(&mut self, peer: PeerId, reason: DisconnectReason) {
+        let (false, Some(barred)) = (may_come_back(reason), self.others.get(&peer)) else { return };
+        let key = barred.key;
+        let called = |other: PeerId| reason == DisconnectReason::NumberTaken && has_called(other);
+        let stays = self.others.iter().any(|(&other, by)| {
+            other != peer && by.key == key && !by.sent_away && (self.is_in(other) || called(other))
+        });
+        if !stays && self.tokens.remove(&key).is_some() {
             self.admit_tokens();
         }
     }

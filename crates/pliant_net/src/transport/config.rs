@@ -100,7 +100,9 @@ pub struct Limits {
     /// 64.
     pub per_address: usize,
     /// Longest message accepted from a peer, bytes. A longer message closes the connection.
-    /// Default: 1 MiB for a host, 256 MiB for a guest (because models are sent as messages).
+    /// Default: 1 MiB for a host, 256 MiB for a guest (because models are sent as messages). Among
+    /// peers, 256 MiB from one that was called, and from all over a
+    /// [`CarrierPort`](super::CarrierPort).
     pub message: usize,
     /// Most bytes of messages that are not yet sent or not yet read, for each peer and direction. A
     /// single message is accepted whatever its length. Toward the peer, a full queue gives
@@ -142,8 +144,8 @@ impl Limits {
         Self { peers: 1, message: 256 << 20, ..Self::host() }
     }
 
-    /// Returns the limits of a connection that a peer opens to another one, which may send it a
-    /// state.
+    /// Returns the limits of a connection among peers on which a state may come: of one that a peer
+    /// opens to another one, and over an app's own netcode of each.
     pub(super) fn of_a_call(&self) -> Self {
         Self { message: Self::guest().message, ..self.clone() }
     }

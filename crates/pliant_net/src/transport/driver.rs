@@ -68,6 +68,9 @@ async fn accept(shared: &Arc<EndpointShared>, quic: &quinn::Endpoint) {
     let mut stopped = pin!(shared.stopped());
     loop {
         let incoming = tokio::select! {
+            // The next host at this address may accept on the same socket already. Whoever came
+            // for it would be refused here.
+            biased;
             () = &mut stopped => break,
             Some(_) = guests.join_next() => continue,
             incoming = quic.accept() => match incoming {

@@ -28,7 +28,7 @@ use bytes::{Buf, BufMut, Bytes, BytesMut};
 use pliant_stream::{Channel, DisconnectReason, PeerId, Role};
 use tracing::debug;
 
-use super::carrier::{CALLED, Carrier, Event, MeshCarrier, SendError, has_called};
+use super::carrier::{CALLED, Carrier, Event, MeshCarrier, SendError};
 use super::config::Limits;
 use super::congestion::Bucket;
 use super::connections::{Connections, GRACE, MESSAGE_PART, PeerConnection};
@@ -436,9 +436,6 @@ impl PortState {
         let hello = message(OPEN, self.numbers, &[]);
         let mut open = Connection::new(self.numbers, id, hello, &remote.path, &joining.connections);
         open.since = joining.since;
-        if has_called(id) {
-            open.limits = open.limits.of_a_call();
-        }
         if let Some(before) = remote.open.replace(open) {
             before.peer.outbox.close(DisconnectReason::Replaced);
             remote.closing.push_back(before);
@@ -584,7 +581,9 @@ impl CarrierPort {
     /// netcode must connect each with each. Two peers have one connection: a call of one who is
     /// there ends as [`DisconnectReason::Full`], and so does one of two calls at the same moment.
     pub fn mesh(&self, limits: Limits) -> impl MeshCarrier {
-        let connections = Arc::new(Connections::new(limits));
+        // Whichever end has opened a connection, a state may come on it. The netcode has delivered
+        // all of it at once where QUIC would hold it back.
+        let connections = Arc::new(Connections::new(limits.of_a_call()));
         self.state().host = Some(Arc::clone(&connections));
         PortCarrier { port: self.clone(), connections, remote: None }
     }
