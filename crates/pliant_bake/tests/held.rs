@@ -270,3 +270,29 @@ fn a_free_bar_between_two_hands_with_shapes_pulls_both_alike() {
     let patch = Patch::around(cube.surface(), 0, 0.2).unwrap();
     assert!(HeldShapes::new(&cube, std::slice::from_ref(&patch)).unwrap().is_none());
 }
+
+#[test]
+fn shapes_that_replace_others_leave_the_motion_as_it_is() {
+    let model = model(&slender(), &config());
+    let own = [[1.0, 0.1, 0.1], [0.5, 0.1, 0.05]].map(|at| {
+        let patch = Patch::around(model.surface(), vertex(&model, at), 0.05).unwrap();
+        Arc::new(HeldShapes::new(&model, &[patch]).unwrap().unwrap())
+    });
+    let end = Patch::around(model.surface(), vertex(&model, [1.0, 0.1, 0.1]), 0.05).unwrap();
+    let mut body = reduced(&model, 1.0 / 60.0, 1.0);
+    let grab = body.grab(&end, GrabConfig::default()).unwrap();
+    body.set_held_shapes(Some(own[0].clone())).unwrap();
+    lead(&mut body, &[(grab, [-0.3, 0.2, 0.0])]);
+    body.release(grab);
+    for _ in 0..5 {
+        body.step().unwrap();
+    }
+    let before = body.state().clone();
+    body.set_held_shapes(Some(own[1].clone())).unwrap();
+    assert_eq!((body.q(), body.v()), (&before.q[..], &before.v[..]));
+    // Where none come in their place, accelerations still follow from the motion.
+    body.set_held_shapes(None).unwrap();
+    let gone = body.state().clone();
+    assert!(gone.v.iter().zip(&before.v).all(|(v, old)| v.abs() <= old.abs() + 1e-12));
+    assert!(body.energy().is_finite() && gone.a.iter().all(|a| a.is_finite()));
+}

@@ -243,7 +243,7 @@ fn a_step_that_would_overflow_is_taken_back() {
 }
 
 #[test]
-fn no_blow_or_push_stops_a_body_for_good() {
+fn no_impulse_or_push_stops_a_body_for_good() {
     for free in [false, true] {
         let model = Arc::new(rod(1e5, 5, 0.01, free));
         let mut body = Body::new(model, BodyConfig::default()).unwrap();

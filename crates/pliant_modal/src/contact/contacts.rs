@@ -79,6 +79,13 @@ pub struct ContactMemory {
     pub toward: [f64; 3],
 }
 
+impl ContactMemory {
+    fn is_valid(&self) -> bool {
+        let near = |x: &[f64; 3]| x.iter().all(|x| x.abs() <= ContactState::LARGEST);
+        near(&self.force) && near(&self.anchor) && self.toward.iter().all(|x| x.abs() <= 1.0 + 1e-6)
+    }
+}
+
 /// What the contacts of a step with obstacles leave for the next. It belongs to the
 /// [`State`](crate::State): who takes over a state, or returns to one, takes over both
 /// ([`Contacts::recall`]).
@@ -117,19 +124,18 @@ impl Clone for ContactState {
 impl ContactState {
     /// Largest number of contacts that a state may have.
     pub const MAX: usize = 1024;
+    /// Largest force (N), coordinate of an anchor (m) and lost energy (J) that a state may have.
+    pub const LARGEST: f64 = 1e9;
 
-    /// Whether all numbers are in their ranges, forces and positions up to 1e9, and each place is
+    /// Whether all numbers are in their ranges, at most [`LARGEST`](Self::LARGEST), and each place is
     /// there once, in the order of obstacles and sites. What has crossed a network is checked with
     /// this.
     pub fn is_valid(&self) -> bool {
-        let near = |x: &[f64; 3]| x.iter().all(|x| x.abs() <= 1e9);
-        let unit = |x: &[f64; 3]| x.iter().all(|x| x.abs() <= 1.0 + 1e-6);
-        let sound = |m: &ContactMemory| near(&m.force) && near(&m.anchor) && unit(&m.toward);
         let place = |m: &ContactMemory| (m.obstacle, m.site);
         (0.5..=1.0).contains(&self.weight)
-            && (0.0..=1e9).contains(&self.lost)
+            && (0.0..=Self::LARGEST).contains(&self.lost)
             && self.memory.len() <= Self::MAX
-            && self.memory.iter().all(sound)
+            && self.memory.iter().all(ContactMemory::is_valid)
             && self.memory.is_sorted_by(|a, b| place(a) < place(b))
     }
 
@@ -255,19 +261,21 @@ impl Contacts {
         self.lost = 0.0;
     }
 
-    /// Writes what the contacts with obstacles have left for the next step.
+    /// Writes what the contacts with obstacles have left for the next step. Contacts whose numbers
+    /// a [`ContactState`] cannot have are left out.
     pub fn remember(&self, into: &mut ContactState) {
-        (into.weight, into.lost) = (self.theta, self.lost);
+        (into.weight, into.lost) = (self.theta, self.lost.min(ContactState::LARGEST));
         into.memory.clear();
         into.memory.extend(self.memory.iter().filter_map(|memory| {
             let Touched::Obstacle(obstacle) = memory.other else { return None };
-            Some(ContactMemory {
+            let memory = ContactMemory {
                 obstacle: u16::try_from(obstacle).ok()?,
                 site: u16::try_from(memory.site).ok()?,
                 force: memory.force.into(),
                 anchor: memory.anchor.into(),
                 toward: memory.toward.into(),
-            })
+            };
+            memory.is_valid().then_some(memory)
         }));
         into.memory.truncate(ContactState::MAX);
     }

@@ -224,8 +224,27 @@ impl ElasticStep {
 
     /// Takes the elastic energy beyond `most` (J) from a state without columns: from its
     /// velocities, and where these do not suffice from its coordinates, along the force over the
-    /// stiffness at rest.
+    /// stiffness at rest. Its accelerations follow from both.
     pub(crate) fn lower(&mut self, most: f64, state: &mut State) {
+        if self.columns > 0 {
+            return;
+        }
+        let mut resisted = self.resisted(state);
+        self.lower_energy(most, state);
+        for (before, after) in resisted.iter_mut().zip(self.resisted(state)) {
+            *before -= after;
+        }
+        state.a.iter_mut().zip(resisted).for_each(|(a, changed)| *a += changed);
+    }
+
+    /// Elastic and damping force of a state without columns, against its motion.
+    fn resisted(&mut self, state: &State) -> Vec<f64> {
+        self.energy.force_at(&state.q, &mut self.way);
+        let damping = self.damping.iter().zip(&state.v).map(|(c, v)| c * v);
+        self.way.iter().zip(damping).map(|(force, damping)| force + damping).collect()
+    }
+
+    fn lower_energy(&mut self, most: f64, state: &mut State) {
         /// Maximum number of steps along the force, each of which ends beyond the goal where the
         /// energy is linear.
         const STEPS: usize = 16;
@@ -238,14 +257,13 @@ impl ElasticStep {
         let left = if kinetic > excess { (1.0 - excess / kinetic).sqrt() } else { 0.0 };
         state.v.iter_mut().for_each(|v| *v *= left);
         let most = most + kinetic.min(excess);
-        let modal = self.omega2.len() - state.q.len();
         for _ in 0..STEPS {
             excess = self.energy.energy(&state.q) - most;
             if excess.is_nan() || excess <= 0.0 {
                 return;
             }
             self.energy.force_at(&state.q, &mut self.way);
-            let pairs = || self.way.iter().zip(&self.omega2[modal..]);
+            let pairs = || self.way.iter().zip(&self.omega2);
             let slope: f64 = pairs().map(|(force, omega2)| force * force / omega2).sum();
             if slope.is_nan() || slope <= 0.0 {
                 return;

@@ -46,7 +46,7 @@ pub struct Load<'a> {
     /// Motion of the anchors of an anchored body over the step. A free body ignores it.
     pub motion: FrameMotion,
     /// The frame of a free body at the end of the step, if it is known from elsewhere. The step
-    /// then takes it as it is, and forces act on the modes alone.
+    /// then takes it as it is, and forces act on the modes alone. An anchored body ignores it.
     pub frame: Option<Frame>,
 }
 
@@ -656,7 +656,7 @@ impl Kernel {
 
     fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
         let gravity = Vector3::from(self.settings.gravity);
-        if let Some(frame) = load.frame {
+        if let Some(frame) = load.frame.filter(|_| self.model.is_free()) {
             state.frame = frame;
         }
         let on_mass = self.mass_force(&state.frame, &load.motion);

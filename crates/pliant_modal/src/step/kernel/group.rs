@@ -548,7 +548,7 @@ impl<P: Member> Group<'_, P> {
     }
 
     /// Stops the members that would pass through each other, because the laws could not be solved
-    /// for a hard blow. Returns whether there are any.
+    /// for a hard impulse. Returns whether there are any.
     fn stop_torn(&mut self, work: &mut Touching) -> bool {
         let torn = |point: &ContactPoint| {
             point.far.as_ref().filter(|far| far.passed && point.violation() > TORN * self.size).is_some()
