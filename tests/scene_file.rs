@@ -165,6 +165,11 @@ fn numbers_out_of_their_range_are_told_where_they_are() {
         ("model: \"pip.modal\"", "model: \"a/.. /s.modal\"", "\"a/", "a path under the folder of assets"),
         ("model: \"pip.modal\"", "model: \"a//s.modal\"", "\"a//", "a path under the folder of assets"),
         ("model: \"pip.modal\"", "model: \"./s.modal\"", "\"./s", "a path under the folder of assets"),
+        ("model: \"pip.modal\"", "model: \"NUL.modal\"", "\"NUL", "a path under the folder of assets"),
+        ("model: \"pip.modal\"", "model: \"con.a.modal\"", "\"con", "a path under the folder of assets"),
+        ("model: \"pip.modal\"", "model: \"aux/s.modal\"", "\"aux", "a path under the folder of assets"),
+        ("model: \"pip.modal\"", "model: \"a\\\\s.modal\"", "\"a\\", "a path under the folder of assets"),
+        ("title: \"one\"", "recording: (file: \"COM1.rrd\")", "\"COM1", "below the working directory"),
         ("title: \"one\"", "recording: (file: \"C:x.rrd\")", "\"C:x", "below the working directory"),
         ("title: \"one\"", "recording: (file: \"a:b/x.rrd\")", "\"a:b", "below the working directory"),
         ("model: \"pip.modal\"", "model: \"pip.obj\"", "\"pip.obj", "a file that ends with .modal"),
@@ -188,6 +193,33 @@ fn numbers_out_of_their_range_are_told_where_they_are() {
         assert_eq!(error.position, Some(place), "{error}");
         assert_eq!(with(part, by), error);
     }
+}
+
+/// A game without the feature has no mesh crate, so that a scene has the rules of paths once more.
+#[cfg(feature = "bake")]
+#[test]
+fn a_scene_and_a_document_of_a_mesh_name_files_by_the_same_rules() {
+    let scene = GOOD.replacen("model: \"pip.modal\"", "bake: (shape: \"pip.obj\")", 1);
+    let scene = SceneFile::from_ron(&scene, "my.ron").unwrap().scene().clone();
+    let taken = |path: &str| {
+        let mut scene = scene.clone();
+        scene.bodies[0].bake.as_mut().unwrap().shape = path.into();
+        SceneFile::new(scene).is_ok()
+    };
+    let devices = "con PRN aux NUL conin$ CONOUT$ Clock$ com0 COM1 com9 COM¹ lpt³ LPT2";
+    let names = "a b.obj .hidden ü..c console null COM com10 comx LPTé a.nul %2e%2e";
+    for path in devices.split(' ').chain(names.split(' ')) {
+        let forms = [
+            "@", "@.txt", "@ .txt", "x/@/y", "x/@.a.b", "/@", "@/", "x//@", "./@", "../@", "x/../@", "x/./@",
+            "x/.../@", "@.", "@ ", "@./y", "@ /y", "\\@", "x\\@", "..\\@", "C:@", "C:/@", "@:stream", "@\0",
+            "@\n", "@\u{85}",
+        ];
+        for path in forms.map(|form| form.replace('@', path)) {
+            assert_eq!(taken(&path), pliant::mesh::io::is_below(&path), "{path:?}");
+        }
+    }
+    assert!(taken("x/console.obj") && !taken("") && !taken(&"a".repeat(1025)));
+    assert!(devices.split(' ').all(|device| !taken(device) && !taken(&format!("x/{device}.obj"))));
 }
 
 #[cfg(feature = "net")]

@@ -268,7 +268,9 @@ fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
         })?;
     // Not every file system syncs folders, and the file is there in any case.
     #[cfg(unix)]
-    if let Some(folder) = goal.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+    if let Some(folder) = goal.parent() {
+        // A bare name is in the current folder.
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
         let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
     }
     Ok(())

@@ -5,6 +5,7 @@
 //! little-endian. The guest's own outgoing data is not recorded, because the session only depends
 //! on what the guest received.
 
+use std::collections::HashSet;
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -16,8 +17,8 @@ use std::time::Duration;
 
 use bevy::log::{error, warn};
 use bytes::Bytes;
-use pliant_modal::ModalModel;
-use pliant_stream::DisconnectReason;
+use pliant_modal::{FileError, ModalModel, ModelHash};
+use pliant_stream::{DisconnectReason, MAX_MESSAGE};
 use thiserror::Error;
 
 use crate::transport::Role;
@@ -32,8 +33,12 @@ const FLUSH_EVERY: Duration = Duration::from_secs(1);
 const MAX_BYTES: u64 = 12 << 30;
 /// Longest time that the end of a recording waits for its disk.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Largest record, bytes. The largest records are models.
-const LONGEST: u32 = 1 << 30;
+/// Most bytes of all different models of a recording together. A guest takes no more from its host.
+const MAX_MODELS: u64 = 1 << 30;
+/// Longest record of a model, bytes. Every other kind of record is much shorter.
+const LONGEST_MODEL: u32 = 1 << 30;
+/// Bytes of a record before its data.
+const HEAD: u64 = 13;
 /// Largest zstd window is 2^27 bytes, so that no file makes a reader allocate more.
 const WINDOW_LOG: u32 = 27;
 
@@ -42,6 +47,35 @@ const DATAGRAM: u8 = 1;
 const MESSAGE: u8 = 2;
 const MODEL: u8 = 3;
 const CLOSED: u8 = 4;
+
+/// Returns the largest number of bytes in a record of a kind. A small compressed file may announce
+/// and hold any number of bytes, so that each kind has no more room than a session uses.
+fn longest(kind: u8) -> u32 {
+    match kind {
+        CONNECTED => 3,
+        DATAGRAM => u32::from(u16::MAX),
+        // The session refuses longer messages.
+        MESSAGE => u32::try_from(MAX_MESSAGE).unwrap_or(u32::MAX),
+        MODEL => LONGEST_MODEL,
+        CLOSED => 1,
+        _ => 0,
+    }
+}
+
+/// Bounds of a recording.
+#[derive(Clone, Copy)]
+struct RecordingLimits {
+    /// Most bytes before compression. When a recording is written, its last record may go beyond.
+    bytes: u64,
+    /// Most bytes of all different models together.
+    models: u64,
+}
+
+impl RecordingLimits {
+    const WRITTEN: Self = Self { bytes: MAX_BYTES, models: MAX_MODELS };
+    /// Every recording within [`Self::WRITTEN`] can be read.
+    const READ: Self = Self { bytes: MAX_BYTES + HEAD + LONGEST_MODEL as u64, models: MAX_MODELS };
+}
 
 /// A piece of data that the guest received.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,6 +94,16 @@ pub(crate) enum SessionRecord {
 }
 
 impl SessionRecord {
+    fn kind(&self) -> u8 {
+        match self {
+            Self::Connected { .. } => CONNECTED,
+            Self::Datagram(_) => DATAGRAM,
+            Self::Message(_) => MESSAGE,
+            Self::Model(_) => MODEL,
+            Self::Closed(_) => CLOSED,
+        }
+    }
+
     /// Size of the record's data in memory, bytes.
     fn len(&self) -> usize {
         match self {
@@ -86,6 +130,23 @@ pub enum RecordingError {
     Kind {
         /// Path of the file.
         path: PathBuf,
+    },
+    /// The file has more data than a recording may have. A small compressed file can have any
+    /// amount of it.
+    #[error("{} has more than {limit} bytes, more than a session records", path.display())]
+    TooLong {
+        /// Path of the file.
+        path: PathBuf,
+        /// Largest number of bytes.
+        limit: u64,
+    },
+    /// The different models in the file are too large together to be kept.
+    #[error("the models in {} have more than {limit} bytes together", path.display())]
+    ModelsTooLarge {
+        /// Path of the file.
+        path: PathBuf,
+        /// Largest number of bytes.
+        limit: u64,
     },
 }
 
@@ -122,17 +183,19 @@ struct RecordWriter {
     encoder: Encoder,
     waiting: Arc<AtomicUsize>,
     written: u64,
-    /// Largest recording, bytes before compression.
-    most: u64,
+    /// Models that are in the file. A replay needs each only once, however many bodies have it.
+    models: HashSet<ModelHash>,
+    model_bytes: u64,
+    limits: RecordingLimits,
     flushed: Duration,
 }
 
 impl SessionRecorder {
     pub(crate) fn create(path: &Path) -> Result<Self, RecordingError> {
-        Self::limited(path, MAX_BYTES)
+        Self::limited(path, RecordingLimits::WRITTEN)
     }
 
-    fn limited(path: &Path, most: u64) -> Result<Self, RecordingError> {
+    fn limited(path: &Path, limits: RecordingLimits) -> Result<Self, RecordingError> {
         let fail = |source| RecordingError::File { path: path.to_owned(), source };
         let mut file = File::create(path).map_err(fail)?;
         file.write_all(MAGIC).map_err(fail)?;
@@ -140,8 +203,15 @@ impl SessionRecorder {
         let waiting = Arc::new(AtomicUsize::new(0));
         let (to, from) = mpsc::sync_channel(MAX_WAITING);
         let (end, ended) = mpsc::channel();
-        let flushed = Duration::ZERO;
-        let mut writer = RecordWriter { encoder, waiting: waiting.clone(), written: 0, most, flushed };
+        let mut writer = RecordWriter {
+            encoder,
+            waiting: waiting.clone(),
+            written: 0,
+            models: HashSet::new(),
+            model_bytes: 0,
+            limits,
+            flushed: Duration::ZERO,
+        };
         let named = path.to_owned();
         let write = move || {
             if let Err(error) = writer.write_all(&from) {
@@ -196,11 +266,17 @@ impl RecordWriter {
                     self.waiting.fetch_sub(record.len(), Ordering::Relaxed);
                     record
                 }
-                KeptRecord::Model(model) => SessionRecord::Model(model.to_bytes().into()),
+                KeptRecord::Model(model) if !self.models.insert(model.hash()) => continue,
+                KeptRecord::Model(model) => {
+                    let bytes = model.to_bytes();
+                    self.model_bytes += bytes.len() as u64;
+                    SessionRecord::Model(bytes.into())
+                }
             };
-            if self.written >= self.most {
+            if let Err(error) = self.room(&record) {
+                // What was recorded so far stays a whole recording.
                 self.encoder.do_finish()?;
-                return Err(io::Error::other(format!("more than {} bytes", self.most)));
+                return Err(error);
             }
             self.written += write(&mut self.encoder, at, &record)?;
             if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
@@ -209,6 +285,22 @@ impl RecordWriter {
             }
         }
         self.encoder.do_finish()
+    }
+
+    /// Checks that a reader will accept the recording with one more record.
+    fn room(&self, record: &SessionRecord) -> io::Result<()> {
+        let RecordingLimits { bytes, models } = self.limits;
+        if self.written >= bytes {
+            return Err(io::Error::other(format!("more than {bytes} bytes")));
+        }
+        if self.model_bytes > models {
+            return Err(io::Error::other(format!("more than {models} bytes of models")));
+        }
+        let longest = longest(record.kind());
+        if record.len() as u64 > u64::from(longest) {
+            return Err(io::Error::other(format!("a record of more than {longest} bytes")));
+        }
+        Ok(())
     }
 }
 
@@ -229,32 +321,32 @@ impl Drop for SessionRecorder {
 
 fn write(to: &mut impl Write, at: Duration, record: &SessionRecord) -> io::Result<u64> {
     let (connected, closed);
-    let (kind, bytes): (u8, &[u8]) = match record {
+    let bytes: &[u8] = match record {
         SessionRecord::Connected { role, max_datagram } => {
             let [low, high] = max_datagram.to_le_bytes();
             connected = [role.to_byte(), low, high];
-            (CONNECTED, &connected)
+            &connected
         }
-        SessionRecord::Datagram(bytes) => (DATAGRAM, bytes),
-        SessionRecord::Message(bytes) => (MESSAGE, bytes),
-        SessionRecord::Model(bytes) => (MODEL, bytes),
+        SessionRecord::Datagram(bytes) | SessionRecord::Message(bytes) | SessionRecord::Model(bytes) => bytes,
         SessionRecord::Closed(reason) => {
             closed = [reason.code()];
-            (CLOSED, &closed)
+            &closed
         }
     };
-    let length = u32::try_from(bytes.len()).ok().filter(|length| *length <= LONGEST);
-    let length = length.ok_or_else(|| io::Error::other("a record of more than a gigabyte"))?;
-    to.write_all(&[kind])?;
+    let length = u32::try_from(bytes.len()).map_err(io::Error::other)?;
+    to.write_all(&[record.kind()])?;
     to.write_all(&u64::try_from(at.as_micros()).unwrap_or(u64::MAX).to_le_bytes())?;
     to.write_all(&length.to_le_bytes())?;
     to.write_all(bytes)?;
-    Ok(13 + u64::from(length))
+    Ok(HEAD + u64::from(length))
 }
+
+/// Decompresses no more than one byte beyond the limit, and has no byte left if there was more.
+type Decoder = io::Take<zstd::stream::read::Decoder<'static, BufReader<File>>>;
 
 /// A recorded session, to be played with [`NetPlugin::replay`](crate::NetPlugin::replay).
 pub struct SessionRecording {
-    decoder: zstd::stream::read::Decoder<'static, BufReader<File>>,
+    decoder: Decoder,
     /// Models that the recorded guest had in its cache.
     pub(crate) models: Vec<Arc<ModalModel>>,
     next: Option<(Duration, SessionRecord)>,
@@ -264,33 +356,54 @@ impl SessionRecording {
     /// Opens a recording. Reads the whole file once, to find its models.
     ///
     /// # Errors
-    /// [`RecordingError`] when the file cannot be read or is not a recording of this version. A
-    /// truncated file is not an error: it is played as far as it goes.
+    /// [`RecordingError`] when the file cannot be read, is not a recording of this version, or has
+    /// more data or larger models than a recording may have. A truncated file is not an error: it
+    /// is played as far as it goes.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, RecordingError> {
-        let path = path.as_ref();
-        let mut first = open(path)?;
+        Self::limited(path.as_ref(), RecordingLimits::READ)
+    }
+
+    fn limited(path: &Path, limits: RecordingLimits) -> Result<Self, RecordingError> {
+        let mut first = open(path, limits)?;
         let mut models = Vec::new();
+        let (mut known, mut room) = (HashSet::new(), limits.models);
+        let mut unread: Option<FileError> = None;
         while let Some((_, record)) = read(&mut first) {
-            if let SessionRecord::Model(bytes) = record {
-                match ModalModel::from_bytes(&bytes) {
-                    Ok(model) => models.push(Arc::new(model)),
-                    Err(error) => warn!("a model in {} cannot be read: {error}", path.display()),
+            let SessionRecord::Model(bytes) = record else { continue };
+            match ModalModel::from_bytes(&bytes) {
+                // A file from anyone may repeat one model any number of times.
+                Ok(model) if known.insert(model.hash()) => {
+                    room = room.checked_sub(bytes.len() as u64).ok_or_else(|| {
+                        RecordingError::ModelsTooLarge { path: path.to_owned(), limit: limits.models }
+                    })?;
+                    models.push(Arc::new(model));
+                }
+                Ok(_) => {}
+                Err(error) => {
+                    unread.get_or_insert(error);
                 }
             }
         }
-        let mut decoder = open(path)?;
-        let next = read(&mut decoder);
+        if first.limit() == 0 {
+            return Err(RecordingError::TooLong { path: path.to_owned(), limit: limits.bytes });
+        }
+        // One line for all of them, because a small file may have millions.
+        if let Some(error) = unread {
+            warn!("a model in {} cannot be read: {error}", path.display());
+        }
+        let mut decoder = open(path, limits)?;
+        let next = read_played(&mut decoder);
         Ok(Self { decoder, models, next })
     }
 
-    /// Returns the next record that was received up to `now`. Call it repeatedly to get all of
-    /// them.
+    /// Returns the next record that was received up to `now`, and never a model. Call it repeatedly
+    /// to get all of them.
     pub(crate) fn poll(&mut self, now: Duration) -> Option<(Duration, SessionRecord)> {
         if self.next.as_ref()?.0 > now {
             return None;
         }
         let due = self.next.take();
-        self.next = read(&mut self.decoder);
+        self.next = read_played(&mut self.decoder);
         due
     }
 
@@ -300,7 +413,7 @@ impl SessionRecording {
     }
 }
 
-fn open(path: &Path) -> Result<zstd::stream::read::Decoder<'static, BufReader<File>>, RecordingError> {
+fn open(path: &Path, limits: RecordingLimits) -> Result<Decoder, RecordingError> {
     let fail = |source| RecordingError::File { path: path.to_owned(), source };
     let mut file = File::open(path).map_err(fail)?;
     let mut magic = [0; 8];
@@ -309,19 +422,30 @@ fn open(path: &Path) -> Result<zstd::stream::read::Decoder<'static, BufReader<Fi
     }
     let mut decoder = zstd::stream::read::Decoder::new(file).map_err(fail)?;
     decoder.window_log_max(WINDOW_LOG).map_err(fail)?;
-    Ok(decoder)
+    Ok(decoder.take(limits.bytes.saturating_add(1)))
+}
+
+/// Reads the next record that is not a model. The caller gets no models, because skipping them one
+/// by one there costs stack.
+fn read_played(from: &mut impl Read) -> Option<(Duration, SessionRecord)> {
+    loop {
+        match read(from)? {
+            (_, SessionRecord::Model(_)) => {}
+            played => return Some(played),
+        }
+    }
 }
 
 /// Reads the next record. Returns `None` at the end of the file and at the first truncated or
 /// invalid record.
 fn read(from: &mut impl Read) -> Option<(Duration, SessionRecord)> {
-    let mut head = [0; 13];
+    let mut head = [0; HEAD as usize];
     from.read_exact(&mut head).ok()?;
     let [kind, rest @ ..] = head;
     let (time, length) = rest.split_first_chunk::<8>()?;
     let at = Duration::from_micros(u64::from_le_bytes(*time));
     let length = u32::from_le_bytes(length.try_into().ok()?);
-    if length > LONGEST {
+    if length > longest(kind) {
         return None;
     }
     // Memory grows with the bytes that are present, not with the announced length.
@@ -375,11 +499,134 @@ mod tests {
         records
     }
 
+    fn limits(bytes: u64, models: u64) -> RecordingLimits {
+        RecordingLimits { bytes, models }
+    }
+
+    /// Data of a record by its kind, written without a limit.
+    type Raw<'a> = (u8, &'a mut dyn Read, u64);
+
+    /// Writes a file of any records, as somebody who means harm would.
+    fn packed(name: &str, records: &mut [Raw<'_>]) -> PathBuf {
+        let path = file(name);
+        let mut file = File::create(&path).unwrap();
+        file.write_all(MAGIC).unwrap();
+        let mut encoder = zstd::stream::write::Encoder::new(file, LEVEL).unwrap();
+        for (kind, data, length) in records {
+            let head = [&[*kind][..], &[0; 8], &(*length as u32).to_le_bytes()].concat();
+            encoder.write_all(&head).unwrap();
+            assert_eq!(io::copy(&mut data.take(*length), &mut encoder).unwrap(), *length);
+        }
+        encoder.finish().unwrap();
+        path
+    }
+
+    fn played(path: &Path) -> Vec<usize> {
+        let mut recording = SessionRecording::open(path).unwrap();
+        std::iter::from_fn(|| recording.poll(Duration::MAX)).map(|(_, record)| record.len()).collect()
+    }
+
+    #[test]
+    fn a_bomb_of_zeros_is_not_unpacked() {
+        for kind in [DATAGRAM, MESSAGE] {
+            let path = packed("bomb", &mut [(kind, &mut io::repeat(0), 256 << 20)]);
+            let bytes = path.metadata().unwrap().len();
+            assert!(bytes < 64 << 10, "{bytes} bytes");
+            assert_eq!(played(&path), [0; 0], "records of kind {kind} from a file of {bytes} bytes");
+        }
+        // The longest records that a session takes are played, and longer ones are not.
+        for (kind, longest) in [(DATAGRAM, 65_535), (MESSAGE, MAX_MESSAGE as u64)] {
+            let records = &mut [longest, longest + 1].map(|length| (kind, io::repeat(7), length));
+            let mut records: Vec<_> = records
+                .iter_mut()
+                .map(|(kind, data, length)| (*kind, data as &mut dyn Read, *length))
+                .collect();
+            assert_eq!(played(&packed("bomb", &mut records)), [longest as usize]);
+        }
+        std::fs::remove_file(file("bomb")).unwrap();
+    }
+
+    #[test]
+    fn a_file_of_too_much_data_is_refused_by_name() {
+        let mut zeros: Vec<_> = (0..1000).map(|_| io::repeat(0)).collect();
+        let mut records: Vec<Raw<'_>> =
+            zeros.iter_mut().map(|zeros| (MESSAGE, zeros as &mut dyn Read, 200_000)).collect();
+        let path = packed("much", &mut records);
+        let bytes = path.metadata().unwrap().len();
+        assert!(bytes < 64 << 10, "{bytes} bytes");
+        let whole = 1000 * (13 + 200_000);
+        for limit in [1 << 20, whole - 1] {
+            let error = SessionRecording::limited(&path, limits(limit, 0)).err();
+            let named = matches!(error, Some(RecordingError::TooLong { limit: told, .. }) if told == limit);
+            assert!(named, "{bytes} bytes of file and {limit} of {whole} bytes of records: {error:?}");
+        }
+        assert!(SessionRecording::limited(&path, limits(whole, 0)).is_ok());
+        std::fs::remove_file(path).unwrap();
+    }
+
+    fn model(name: &str) -> Vec<u8> {
+        let assets = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
+        std::fs::read(Path::new(assets).join(name)).unwrap()
+    }
+
+    #[test]
+    fn models_are_kept_once_and_up_to_a_bound() {
+        let (bud, jack) = (model("bud.modal"), model("jack.modal"));
+        let (bud_bytes, jack_bytes) = (bud.len() as u64, jack.len() as u64);
+        // A file that repeats a model, and has one that is no model, before the only message.
+        let mut many = vec![&bud[..]; 50];
+        many.extend([&jack[..], &bud[..9]]);
+        let mut records: Vec<Raw<'_>> = many
+            .iter_mut()
+            .map(|bytes| {
+                let length = bytes.len() as u64;
+                (MODEL, bytes as &mut dyn Read, length)
+            })
+            .collect();
+        let mut text = &b"a message"[..];
+        records.push((MESSAGE, &mut text, 9));
+        let path = packed("models", &mut records);
+        let kept = SessionRecording::open(&path).unwrap().models.len();
+        assert_eq!(kept, 2, "models kept of 51, of which 2 differ");
+        assert_eq!(played(&path), [9], "a replay is given no models");
+        let both = bud_bytes + jack_bytes;
+        let within = |models| SessionRecording::limited(&path, limits(1 << 30, models));
+        let error = within(both - 1).err();
+        let named = matches!(error, Some(RecordingError::ModelsTooLarge { limit, .. }) if limit == both - 1);
+        assert!(named, "{error:?}");
+        assert_eq!(within(both).unwrap().models.len(), 2);
+
+        // What is recorded has each model once as well, and no more than can be read again.
+        for (most, expected) in [(both, 2), (both - 1, 1)] {
+            let mut recorder = SessionRecorder::limited(&path, limits(1 << 30, most)).unwrap();
+            for bytes in [&bud, &bud, &jack, &bud] {
+                recorder.put_model(Duration::ZERO, &Arc::new(ModalModel::from_bytes(bytes).unwrap()));
+            }
+            drop(recorder);
+            let mut records = open(&path, RecordingLimits::READ).unwrap();
+            let written = std::iter::from_fn(|| read(&mut records)).count();
+            assert_eq!(written, expected, "models written of 4, of which 2 differ");
+        }
+        std::fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn a_message_that_no_session_takes_ends_the_recording_and_leaves_it_whole() {
+        let path = file("long");
+        let mut recorder = SessionRecorder::create(&path).unwrap();
+        for length in [9, MAX_MESSAGE, MAX_MESSAGE + 1, 9] {
+            recorder.put(Duration::ZERO, &SessionRecord::Message(vec![7; length].into()));
+        }
+        drop(recorder);
+        assert_eq!(played(&path), [9, MAX_MESSAGE]);
+        std::fs::remove_file(path).unwrap();
+    }
+
     #[test]
     fn a_recording_ends_at_its_limit_and_is_whole() {
         let path = file("limited");
         let records = records();
-        let mut recorder = SessionRecorder::limited(&path, 20_000).unwrap();
+        let mut recorder = SessionRecorder::limited(&path, limits(20_000, 0)).unwrap();
         // All within a second, so that nothing was written out before the limit.
         records.iter().for_each(|(_, record)| recorder.put(Duration::from_millis(1), record));
         drop(recorder);

@@ -76,15 +76,33 @@ fn name(path: &[Step], name: &str) -> Checked {
     Err(fault(path, SceneErrorKind::Value, message))
 }
 
-/// Whether a path consists of names of folders and a file only, on every system, whatever system
-/// this is. A scene from someone else must not reach beyond its folder.
+/// Returns whether a path consists of names of folders and of a file only, with `/` between them,
+/// on every system, whatever system this is. A scene from someone else must not reach beyond its
+/// folder.
 ///
-/// Windows separates by both slashes, ends a drive, a stream or an asset source by a colon, and
-/// takes `.. ` and `...` for `..` in places.
-fn is_below(file: &str) -> bool {
-    file.len() <= 1024
-        && !file.contains(|c: char| c == ':' || c.is_control())
-        && file.split(['/', '\\']).all(|part| !part.is_empty() && !part.ends_with(['.', ' ']))
+/// The rules are those of `pliant_mesh::io::is_below`, for the files that meshes name. A game that
+/// bakes nothing leaves that crate out, so that they are here once more. A test compares the two.
+fn is_below(path: &str) -> bool {
+    path.len() <= 1024
+        && !path.contains(|c: char| matches!(c, '\\' | ':') || c.is_control())
+        && path.split('/').all(|name| !name.is_empty() && !name.ends_with(['.', ' ']) && !is_device(name))
+}
+
+/// Returns whether Windows takes a name for a device. It ignores what follows the first dot, and
+/// spaces before that.
+fn is_device(name: &str) -> bool {
+    let stem = name.split_once('.').map_or(name, |(stem, _)| stem).trim_end_matches(' ');
+    let is = |device: &&str| stem.eq_ignore_ascii_case(device);
+    if ["CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$", "CLOCK$"].iter().any(is) {
+        return true;
+    }
+    let ports = stem.split_at_checked(3);
+    ports.is_some_and(|(port, number)| {
+        ["COM", "LPT"].iter().any(|device| port.eq_ignore_ascii_case(device))
+            // Windows takes a raised digit for a digit.
+            && matches!(number.chars().next(), Some('0'..='9' | '¹' | '²' | '³'))
+            && number.chars().count() == 1
+    })
 }
 
 /// Checks that a path stays under the folder of assets.

@@ -4,11 +4,7 @@
 //! This module parses the document itself, because the validation of the `gltf` crate panics on
 //! some damaged documents.
 
-use std::{
-    borrow::Cow,
-    collections::HashMap,
-    path::{Component, Path, PathBuf},
-};
+use std::{borrow::Cow, collections::HashMap, path::Path};
 
 use nalgebra::{Matrix4, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, de::IgnoredAny};
@@ -340,7 +336,7 @@ impl GltfNode {
 /// Files that a document names, each read once.
 struct Files<'a> {
     folder: &'a Path,
-    read: HashMap<PathBuf, Vec<u8>>,
+    read: HashMap<String, Vec<u8>>,
     /// Total number of bytes of all files.
     bytes: usize,
 }
@@ -349,34 +345,32 @@ impl Files<'_> {
     fn read(&mut self, buffer: &Buffer) -> Result<(), MeshError> {
         let Some(path) = buffer.file() else { return Ok(()) };
         // Only files in the folder of the document are allowed.
-        if !path.components().all(|part| matches!(part, Component::Normal(_))) {
-            return Err(wrong("a file in the folder of the document", path.display().to_string()));
+        if !super::is_below(path) {
+            return Err(wrong("a file in the folder of the document", path));
         }
-        let path: PathBuf = path.components().collect();
-        if self.read.contains_key(&path) {
+        if self.read.contains_key(path) {
             return Ok(());
         }
-        let bytes = super::bytes(&self.folder.join(&path))?;
+        let bytes = super::bytes(&self.folder.join(path))?;
         self.bytes = self.bytes.saturating_add(bytes.len());
         if self.bytes as u64 > super::MAX_FILE {
             return Err(wrong(format!("files of at most {} bytes in all", super::MAX_FILE), "more"));
         }
-        self.read.insert(path, bytes);
+        self.read.insert(path.to_owned(), bytes);
         Ok(())
     }
 }
 
 impl Buffer {
     /// Returns the path of the file that the document names for this buffer.
-    fn file(&self) -> Option<&Path> {
-        self.uri.as_deref().filter(|uri| !uri.starts_with("data:")).map(Path::new)
+    fn file(&self) -> Option<&str> {
+        self.uri.as_deref().filter(|uri| !uri.starts_with("data:"))
     }
 
     fn data<'a>(&self, blob: Option<&'a [u8]>, files: &'a Files) -> Result<Cow<'a, [u8]>, MeshError> {
         if let Some(path) = self.file() {
-            let path: PathBuf = path.components().collect();
-            let bytes = files.read.get(&path).map(|bytes| Cow::Borrowed(&bytes[..]));
-            return bytes.ok_or_else(|| wrong("a file that was read", path.display().to_string()));
+            let bytes = files.read.get(path).map(|bytes| Cow::Borrowed(&bytes[..]));
+            return bytes.ok_or_else(|| wrong("a file that was read", path));
         }
         let Some(data) = self.uri.as_deref().and_then(|uri| uri.strip_prefix("data:")) else {
             return blob.map(Cow::Borrowed).ok_or_else(|| wrong("binary data after the document", "none"));
@@ -459,6 +453,22 @@ pub(super) mod tests {
         assert!(message(document(DATA, "18446744073709551615", CHILDREN)).contains("data within its buffer"));
         assert!(message(document("../secret.bin", "3", CHILDREN)).contains("in the folder of the document"));
         assert!(message(document("/etc/hostname", "3", CHILDREN)).contains("in the folder of the document"));
+        for uri in [
+            "nul",
+            "COM1.bin",
+            "con.txt",
+            "a/aux/b.bin",
+            "a:stream",
+            "C:a.bin",
+            "a.bin.",
+            "a./b.bin",
+            "a /b.bin",
+        ] {
+            let found = message(document(uri, "3", CHILDREN));
+            assert!(found.contains("in the folder of the document"), "{uri}: {found}");
+        }
+        // In JSON, a backslash is two.
+        assert!(message(document("a\\\\b.bin", "3", CHILDREN)).contains("in the folder of the document"));
         assert!(message(document("data:;base64,!!", "3", CHILDREN)).contains("base 64"));
         assert!(message(document(DATA, "3", r#","children":[0]"#)).contains("a tree of nodes"));
         assert!(message(document(DATA, "3", r#","children":[9]"#)).contains("one of 2 nodes, found node 9"));
@@ -520,7 +530,7 @@ pub(super) mod tests {
         let mut files = Files { folder: &folder, read: HashMap::new(), bytes: 0 };
         for uri in ["a.bin", "a.bin", "a.bin/", "./a.bin"] {
             let read = files.read(&Buffer { uri: Some(uri.into()) });
-            assert_eq!(read.is_ok(), !uri.starts_with('.'), "{uri}");
+            assert_eq!(read.is_ok(), uri == "a.bin", "{uri}");
         }
         assert_eq!((files.read.len(), files.bytes), (1, 42));
         let surface = parse(document("a.bin", "3", CHILDREN).as_bytes(), &folder).unwrap();

@@ -17,6 +17,7 @@
 //! For any bytes in a file, reading gives a mesh or an error and takes memory in proportion to the
 //! file.
 
+mod below;
 mod cursor;
 mod gltf;
 mod medit;
@@ -40,6 +41,7 @@ use crate::{
     stuff,
 };
 
+pub use below::is_below;
 pub use msh::MshVersion;
 
 /// Largest accepted file, bytes.
@@ -280,7 +282,9 @@ pub fn write_whole(
     )?;
     // Not every file system syncs folders, and the file is there in any case.
     #[cfg(unix)]
-    if let Some(folder) = goal.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+    if let Some(folder) = goal.parent() {
+        // A bare name is in the current folder.
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
         let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
     }
     Ok(())

@@ -1,9 +1,12 @@
 //! Identities: Ed25519 keys, their fingerprints, and the checks made in the TLS handshake.
 
+use std::ffi::OsStr;
 use std::fmt;
-use std::io::Write;
+use std::fs::{self, File};
+use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rcgen::{CertificateParams, KeyPair, PKCS_ED25519, PublicKeyData};
@@ -120,7 +123,15 @@ pub enum IdentityError {
         /// Path of the file.
         path: PathBuf,
         /// Error of the operating system.
-        source: std::io::Error,
+        source: io::Error,
+    },
+    /// The file of the key is empty. Another program, or an earlier version of this one, died
+    /// before it had written a key. The file is left as it is, because its writer may still be at
+    /// work.
+    #[error("the key in {}: the file is empty; delete it to get a new key", path.display())]
+    Empty {
+        /// Path of the file.
+        path: PathBuf,
     },
 }
 
@@ -150,27 +161,42 @@ impl Identity {
     }
 
     /// Reads the key in a file, or makes a key and creates the file with it. A file that this
-    /// function creates was never readable for anyone but its owner (mode 0600, on Unix).
+    /// function creates was never readable for anyone but its owner (mode 0600, on Unix), and has
+    /// its name only when the whole key is in it and synced. Of several callers at one moment, in
+    /// any number of processes, all get the key of the first.
+    ///
+    /// Where the file system has no hard links, the file has its name from the beginning: a caller
+    /// at the same moment may get an error, and a loss of power may leave an empty file.
     ///
     /// # Errors
-    /// [`IdentityError::File`] when the file cannot be read or created, [`IdentityError::Key`] when
-    /// it holds no key, and [`IdentityError::Generate`].
+    /// [`IdentityError::File`] when the file cannot be read or created, [`IdentityError::Empty`]
+    /// when there is nothing in it, [`IdentityError::Key`] when it holds no key, and
+    /// [`IdentityError::Generate`].
     pub fn at(path: impl AsRef<Path>) -> Result<Self, IdentityError> {
         let path = path.as_ref();
         let fail = |source| IdentityError::File { path: path.to_owned(), source };
-        match std::fs::read(path) {
-            Ok(der) => return Self::from_pkcs8(&der),
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
-            Err(error) => return Err(fail(error)),
+        if let Some(kept) = Self::kept(path)? {
+            return Ok(kept);
         }
         let made = Self::generate()?;
-        let mut options = std::fs::OpenOptions::new();
-        options.write(true).create_new(true);
-        #[cfg(unix)]
-        std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-        let mut file = options.open(path).map_err(fail)?;
-        file.write_all(&made.to_pkcs8()).and_then(|()| file.sync_all()).map_err(fail)?;
-        Ok(made)
+        match create_whole(path, &made.to_pkcs8(), |part, path| fs::hard_link(part, path)) {
+            Ok(()) => Ok(made),
+            // Another caller was first, or a link that leads nowhere waits at the name.
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                Self::kept(path)?.ok_or_else(|| fail(error))
+            }
+            Err(error) => Err(fail(error)),
+        }
+    }
+
+    /// Returns the key in a file, or `None` if there is no file.
+    fn kept(path: &Path) -> Result<Option<Self>, IdentityError> {
+        match fs::read(path) {
+            Ok(der) if der.is_empty() => Err(IdentityError::Empty { path: path.to_owned() }),
+            Ok(der) => Self::from_pkcs8(&der).map(Some),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            Err(source) => Err(IdentityError::File { path: path.to_owned(), source }),
+        }
     }
 
     /// Restores an identity from the bytes of [`Identity::to_pkcs8`].
@@ -202,6 +228,75 @@ impl Identity {
     pub(super) fn chain(&self) -> (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>) {
         (vec![self.certificate.clone()], PrivatePkcs8KeyDer::from(self.key.serialize_der()).into())
     }
+}
+
+/// Creates a file of a secret with all of its bytes, or fails with [`ErrorKind::AlreadyExists`] if
+/// anything has its name. Nothing is followed or replaced. `link` makes a hard link.
+fn create_whole(
+    path: &Path,
+    secret: &[u8],
+    link: impl FnOnce(&Path, &Path) -> io::Result<()>,
+) -> io::Result<()> {
+    let name = path.file_name().ok_or(ErrorKind::InvalidFilename)?;
+    let (file, part) = new_part(path, name)?;
+    // A rename would replace the key of a faster process, and a link does not.
+    let created = write_synced(file, secret).and_then(|()| match link(&part, path) {
+        // Some file systems have no hard links, and each system has another error for that.
+        Err(error) if error.kind() != ErrorKind::AlreadyExists => {
+            create_private(path).and_then(|file| {
+                write_synced(file, secret).inspect_err(|_| {
+                    // The first error is the one to report.
+                    let _ = fs::remove_file(path);
+                })
+            })
+        }
+        linked => linked,
+    });
+    // The key has its name or is not wanted. A part that stays behind is its owner's only.
+    let _ = fs::remove_file(&part);
+    created?;
+    // Not every file system syncs folders, and the file is there in any case.
+    #[cfg(unix)]
+    if let Some(folder) = path.parent() {
+        // The folder of a bare name is the working directory.
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+        let _ = File::open(folder).and_then(|folder| folder.sync_all());
+    }
+    Ok(())
+}
+
+fn write_synced(mut file: File, bytes: &[u8]) -> io::Result<()> {
+    file.write_all(bytes).and_then(|()| file.sync_all())
+}
+
+/// Creates a file that did not exist before, for its owner only.
+fn create_private(path: &Path) -> io::Result<File> {
+    let mut options = fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    options.open(path)
+}
+
+/// Creates a temporary file beside `goal` that did not exist before.
+fn new_part(goal: &Path, name: &OsStr) -> io::Result<(File, PathBuf)> {
+    /// Most names that are tried, because files of killed writers may have them.
+    const MAX: usize = 1000;
+    // Threads that create the same file write separate temporary files.
+    static PARTS: AtomicU64 = AtomicU64::new(0);
+    for _ in 0..MAX {
+        let number = PARTS.fetch_add(1, Ordering::Relaxed);
+        let mut part = name.to_owned();
+        part.push(format!(".{}.{number}.part", std::process::id()));
+        let part = goal.with_file_name(part);
+        match create_private(&part) {
+            Ok(file) => return Ok((file, part)),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(error),
+        }
+    }
+    // Not `AlreadyExists`, which says that the goal exists.
+    Err(io::Error::other("a thousand temporary files of killed programs wait beside it"))
 }
 
 /// The name in every certificate and handshake. Trust comes from the pinned key, not from a name.
@@ -339,6 +434,72 @@ mod tests {
         }
         std::fs::write(&path, "no key").unwrap();
         assert!(matches!(Identity::at(&path), Err(IdentityError::Key(_))));
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn all_who_make_a_key_at_the_same_moment_get_the_same_key() {
+        let folder = std::env::temp_dir().join(format!("pliant_net-race-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let threads = 4;
+        for round in 0..50 {
+            let path = folder.join(format!("key-{round}"));
+            let begin = std::sync::Barrier::new(threads);
+            let made: Vec<_> = std::thread::scope(|scope| {
+                let make = || {
+                    begin.wait();
+                    Identity::at(&path).map(|made| made.fingerprint())
+                };
+                let made: Vec<_> = (0..threads).map(|_| scope.spawn(make)).collect();
+                made.into_iter().map(|made| made.join().unwrap()).collect()
+            });
+            let kept = Identity::at(&path).unwrap().fingerprint();
+            assert!(made.iter().all(|made| made.as_ref().ok() == Some(&kept)), "round {round}: {made:?}");
+        }
+        // The temporary files are gone, and every key is its owner's only.
+        let kept: Vec<_> = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap()).collect();
+        assert_eq!(kept.len(), 50, "{kept:?}");
+        #[cfg(unix)]
+        for entry in &kept {
+            use std::os::unix::fs::PermissionsExt;
+            assert_eq!(entry.metadata().unwrap().permissions().mode() & 0o777, 0o600);
+        }
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_key_is_kept_also_where_there_are_no_hard_links() {
+        let folder = std::env::temp_dir().join(format!("pliant_net-no-links-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join("key");
+        let made = Identity::generate().unwrap();
+        let create =
+            || create_whole(&path, &made.to_pkcs8(), |_, _| Err(io::Error::from(ErrorKind::Unsupported)));
+        create().unwrap();
+        assert_eq!(Identity::at(&path).unwrap().fingerprint(), made.fingerprint());
+        assert_eq!(create().unwrap_err().kind(), ErrorKind::AlreadyExists);
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            assert_eq!(path.metadata().unwrap().permissions().mode() & 0o777, 0o600);
+        }
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn an_empty_file_of_a_key_is_told_with_its_remedy() {
+        let folder = std::env::temp_dir().join(format!("pliant_net-empty-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join("key");
+        File::create(&path).unwrap();
+        let error = Identity::at(&path).unwrap_err().to_string();
+        assert!(error.contains("the file is empty; delete it"), "{error}");
+        // Whoever wrote it may still be at work, so that it is not replaced.
+        assert_eq!(path.metadata().unwrap().len(), 0);
+        std::fs::remove_file(&path).unwrap();
+        let made = Identity::at(&path).unwrap();
+        assert_eq!(Identity::at(&path).unwrap().fingerprint(), made.fingerprint());
         std::fs::remove_dir_all(folder).unwrap();
     }
 
