@@ -36,7 +36,8 @@ pub struct Grab {
     /// last valid target stays.
     pub target: DVec3,
     /// Stiffness of the hand's own spring (a device's coupling), N/m, above 0, in series with the
-    /// patch's compliance. Default: `None`, as stiff as the patch allows.
+    /// patch's compliance. Default: `None`, as stiff as the patch allows. Infinity makes the rigid
+    /// constraint of [`GrabConfig::RIGID`](pliant_modal::GrabConfig::RIGID), which trembles.
     pub stiffness: Option<f64>,
     /// Relaxation time of the coupling's damper, s, 0 or more. Default: `0.0`.
     pub relaxation: f64,

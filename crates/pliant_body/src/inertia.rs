@@ -122,9 +122,10 @@ pub(crate) struct Ride {
     ways: Vec<Way>,
     /// Time by which the body feels the motion late, s.
     delay: f64,
-    /// Velocities and time up to which the body has felt the motion. `None` before the first way.
-    felt: Option<[DVec3; 2]>,
-    felt_until: f64,
+    /// Velocities and time up to which the motion has acted on the body. `None` before the first
+    /// way.
+    applied: Option<[DVec3; 2]>,
+    applied_until: f64,
 }
 
 impl Ride {
@@ -143,7 +144,7 @@ impl Ride {
         if !is_still && self.by_tick == moved {
             self.by_tick = !moved;
             self.ways.clear();
-            (self.felt_until, self.delay) = (0.0, 0.0);
+            (self.applied_until, self.delay) = (0.0, 0.0);
         }
         let time = |look: &Look| if self.by_tick { look.tick } else { look.frame };
         let seconds = time(&now) - time(&last);
@@ -153,13 +154,13 @@ impl Ride {
             if way.is_none() {
                 // What was turned goes on ahead.
                 let turn = now.pose.orientation * last.pose.orientation.inverse();
-                self.felt = self.felt.map(|felt| felt.map(|velocity| turn * velocity));
+                self.applied = self.applied.map(|applied| applied.map(|velocity| turn * velocity));
                 for way in &mut self.ways {
                     way.velocity = way.velocity.map(|velocity| turn * velocity);
                     way.orientation = turn * way.orientation;
                 }
             }
-            let ahead = self.ways.last().map(|way| way.velocity).or(self.felt);
+            let ahead = self.ways.last().map(|way| way.velocity).or(self.applied);
             let from = if way.is_some() { last.pose.orientation } else { now.pose.orientation };
             if let (Some(velocity), true) = (way.or(ahead), seconds > 0.0) {
                 if self.ways.len() == Self::WAYS {
@@ -174,9 +175,9 @@ impl Ride {
         let late = if self.by_tick { 0.5 * step } else { 1.5 * frame + 0.5 * step };
         // Frames differ in length.
         self.delay = if self.delay > 0.0 { 0.9 * self.delay + 0.1 * late } else { late };
-        let until = (now.tick - self.delay).max(self.felt_until);
-        let middle = 0.5 * (until + self.felt_until.max(until - step));
-        self.felt_until = until;
+        let until = (now.tick - self.delay).max(self.applied_until);
+        let middle = 0.5 * (until + self.applied_until.max(until - step));
+        self.applied_until = until;
         let (Some((velocity, orientation)), Some((_, axes))) = (self.at(until), self.at(middle)) else {
             return FrameMotion::default();
         };
@@ -187,17 +188,17 @@ impl Ride {
         let unsure = [8.0 * ulp * far / shortest, 16.0 * ulp / shortest];
         let mut accelerations = [DVec3::ZERO; 2];
         // A body that begins on a moving entity moves with it.
-        let felt = self.felt.get_or_insert(velocity);
+        let applied = self.applied.get_or_insert(velocity);
         for (k, acceleration) in accelerations.iter_mut().enumerate() {
-            let change = velocity[k] - felt[k];
+            let change = velocity[k] - applied[k];
             let stopped = velocity[k] == DVec3::ZERO && change != DVec3::ZERO;
             if stopped || change.length() > unsure[k] + 1e-6 * velocity[k].length() {
-                felt[k] = velocity[k];
+                applied[k] = velocity[k];
                 *acceleration = axes.inverse() * (change / step);
             }
         }
         let [acceleration, angular_acceleration] = accelerations.map(Into::into);
-        let angular_velocity = (orientation.inverse() * felt[1]).into();
+        let angular_velocity = (orientation.inverse() * applied[1]).into();
         FrameMotion { acceleration, angular_velocity, angular_acceleration }
     }
 

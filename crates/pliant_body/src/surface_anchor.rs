@@ -88,7 +88,7 @@ fn resting_axes(triangle: &DMat3) -> DMat3 {
 }
 
 /// The surface of a body that is shown in this frame.
-struct Shown<'a> {
+struct VisualSurface<'a> {
     model: &'a ModalModel,
     warps: bool,
     visual: &'a VisualState,
@@ -96,7 +96,7 @@ struct Shown<'a> {
     q: &'a [f64],
 }
 
-impl Shown<'_> {
+impl VisualSurface<'_> {
     fn vertex(&self, vertex: u32) -> Option<DVec3> {
         let mut at = DVec3::from(self.model.vertex_position(vertex, self.q, self.warps)?);
         if let Some((shapes, s)) = self.visual.held()
@@ -157,7 +157,7 @@ pub(crate) fn place_on_surfaces(
         }
         let SurfacePlace::In { triangle, weights } = anchor.place else { continue };
         visual.draw(&mut q);
-        let shown = Shown { model: state.model(), warps: state.warps(), visual, q: &q };
+        let shown = VisualSurface { model: state.model(), warps: state.warps(), visual, q: &q };
         let surface = state.model().surface();
         if triangle as usize >= surface.triangles().len() || !weights.is_finite() {
             refuse(BodyError::NoSurfacePlace);

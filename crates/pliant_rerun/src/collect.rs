@@ -31,7 +31,7 @@ pub(crate) struct Collector {
     metrics: Due,
     hands: Due,
     modes: Due,
-    words: Due,
+    texts: Due,
     bodies: HashMap<Entity, Followed>,
     /// Whether there are new bodies that no frame contains yet.
     untold: bool,
@@ -105,13 +105,13 @@ pub(crate) struct WantedData {
     /// Whether the energies of the modes are drawn as bars.
     bars: bool,
     /// Whether states that are logged as text are checked for changes, a few times per second.
-    words: bool,
+    texts: bool,
     /// Length of a tick, s.
     tick: f64,
 }
 
 /// Rate of checks for states that are logged as text, Hz of simulated time.
-const WORDS_HZ: f64 = 10.0;
+const TEXTS_HZ: f64 = 10.0;
 
 struct Followed {
     drawn: Arc<Drawn>,
@@ -130,7 +130,7 @@ impl Collector {
             metrics: Due::NEVER,
             hands: Due::NEVER,
             modes: Due::NEVER,
-            words: Due::NEVER,
+            texts: Due::NEVER,
             bodies: HashMap::new(),
             untold: false,
             had_hands: false,
@@ -154,7 +154,7 @@ pub(crate) fn wants_hands(wanted: Res<WantedData>) -> bool {
 }
 
 pub(crate) fn wants_text(wanted: Res<WantedData>) -> bool {
-    wanted.words
+    wanted.texts
 }
 
 /// Drops gathered data while no sink is open or the recording is off, because this data does not
@@ -202,7 +202,7 @@ pub(crate) fn decide(
         hands: collector.hands.at(now, recording.hands_hz),
         sample: recording.modes_hz > 0.0,
         bars: collector.modes.at(now, recording.modes_hz),
-        words: collector.words.at(now, WORDS_HZ),
+        texts: collector.texts.at(now, TEXTS_HZ),
         tick: time.delta_secs_f64(),
     };
 }

@@ -78,8 +78,8 @@ pub(crate) fn log_devices(
         match &now {
             (LoopState::Running, None) => own.log(format!("{name}: running")),
             (LoopState::Running, Some(fault)) => own.warn(format!("{name}: {fault}")),
-            (state, None) => own.warn(format!("{name}: {}", words(*state))),
-            (state, Some(fault)) => own.warn(format!("{name}: {}, {fault}", words(*state))),
+            (state, None) => own.warn(format!("{name}: {}", described(*state))),
+            (state, Some(fault)) => own.warn(format!("{name}: {}, {fault}", described(*state))),
         }
         logged.insert(id, now);
     }
@@ -122,7 +122,7 @@ pub(crate) fn take_samples(
     }
 }
 
-fn words(state: LoopState) -> &'static str {
+fn described(state: LoopState) -> &'static str {
     match state {
         LoopState::Running => "running",
         LoopState::Calibrating => "waits for its calibration",

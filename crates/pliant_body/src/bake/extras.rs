@@ -53,8 +53,11 @@ impl BakeRequest {
     /// # }
     /// ```
     pub fn with_extras(mut self, json: &str) -> Result<Self, BakeExtrasError> {
-        let extras: Extras =
-            serde_json::from_str(json).map_err(|error| BakeExtrasError::Json(error.to_string()))?;
+        let unread = |error: serde_json::Error| BakeExtrasError::Json(error.to_string());
+        // A list would be read as the properties in their order.
+        let object: serde_json::Map<String, serde_json::Value> =
+            serde_json::from_str(json).map_err(unread)?;
+        let extras = Extras::deserialize(serde_json::Value::Object(object)).map_err(unread)?;
         let anchors = match extras.anchor {
             None => Vec::new(),
             Some(Anchors::One(one)) => vec![one],

@@ -79,7 +79,15 @@ fn the_properties_of_a_model_say_how_it_is_baked() {
     let two = bar(4).with_extras(r#"{"anchor":["x>0.999","z < 0"]}"#).unwrap().config;
     assert_eq!((two.anchors.len(), two.young, two.density), (3, plain.young, plain.density));
     assert_eq!(bar(4).with_extras("{}").unwrap().config, plain);
-    for wrong in ["", "7", "[]", r#"{"anchor":3}"#, r#"{"density":"heavy"}"#, r#"{"stiffness":true}"#] {
+    for wrong in [
+        "",
+        "7",
+        "[]",
+        r#"["y<0.01", 4e4, 950]"#,
+        r#"{"anchor":3}"#,
+        r#"{"density":"heavy"}"#,
+        r#"{"stiffness":true}"#,
+    ] {
         assert!(matches!(bar(4).with_extras(wrong), Err(BakeExtrasError::Json(_))), "{wrong}");
     }
     let error = bar(4).with_extras(r#"{"anchor":"left"}"#).unwrap_err();
