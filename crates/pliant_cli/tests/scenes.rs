@@ -206,7 +206,10 @@ const IN_BROWSERS: [&str; 10] = [
 /// A lint for types cannot tell: natively `bevy::platform::time::Instant` and `web_time::Instant`
 /// are the standard library's.
 fn standard_clocks(text: &str) -> Vec<String> {
-    let text = text.split("\n#[cfg(test)]").next().unwrap_or_default();
+    // Tests within a file are its end. A module of tests in another file is not.
+    let within = |(at, _): &(usize, &str)| text[*at..].lines().nth(1).is_some_and(|l| l.ends_with('{'));
+    let end = text.match_indices("#[cfg(test)]\nmod ").find(within).map_or(text.len(), |(at, _)| at);
+    let text = &text[..end];
     let whole = |line: &str| line.split(|c: char| !c.is_alphanumeric()).any(|word| word == "Instant");
     text.split_inclusive(';')
         .map(|statement| {
@@ -229,6 +232,7 @@ fn clocks_are_those_that_browsers_have() {
         "use std::{\n    fs,\n    time::{Duration, Instant},\n};",
         "fn now() {\n    let now = std::time::Instant::now();\n}",
         "use std::time;\nfn now() { time::Instant::now(); }",
+        "#[cfg(test)]\nmod tests;\n\nuse std::time::Instant;",
     ] {
         assert_eq!(standard_clocks(wrong).len(), 1, "{wrong} is not found");
     }

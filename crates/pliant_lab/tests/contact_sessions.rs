@@ -267,7 +267,7 @@ fn drag(body: BodyId, begin: Duration) -> Box<dyn FnMut(Duration, &mut GuestSess
 }
 
 /// Runs a session of some bodies that fall, rest, and of which a guest drags the first over the
-/// floor from the tenth second on. Prints what the guest shows.
+/// floor from the twelfth second on. Prints what the guest shows.
 fn run(count: usize, told: bool) -> [Errors; 3] {
     let model = jack();
     let pile = Pile { count, rate: RATE, elasticity: Some(Elasticity::Linear), ..Pile::default() };
@@ -331,7 +331,7 @@ fn a_pile_is_shown_where_it_is() {
     // a load only. Without the floor it is farther off still.
     let [falls_through, dragged_through, own_through] = run(10, false);
     assert!(falls.rms() < 0.5 * falls_through.rms(), "{falls:?} {falls_through:?}");
-    // Most of it are the blows between the bodies, which only the host knows.
+    // Most of it are the impulses between the bodies, which only the host knows.
     assert!(dragged.rms() < 0.75 * dragged_through.rms(), "{dragged:?} {dragged_through:?}");
     assert!(own.rms() < 0.65 * own_through.rms(), "{own:?} {own_through:?}");
 }

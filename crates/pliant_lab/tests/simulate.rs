@@ -53,6 +53,14 @@ fn fifty_sessions_under_faults_keep_what_must_hold() {
     assert_eq!(report.faults.len(), FaultKind::ALL.len(), "{:?}", report.faults);
 }
 
+/// In these a malicious peer tells false ticks, which hurry the others or hold them up.
+#[test]
+fn peers_that_are_told_false_ticks_keep_what_must_hold() {
+    for seed in [185, 359] {
+        run(seed, 1);
+    }
+}
+
 #[test]
 fn a_seed_gives_the_same_session_again() {
     let (first, again) = (run(7, 2), run(7, 2));

@@ -153,7 +153,8 @@ pub struct Metrics {
     /// Time from a hand's motion to the force that answers it, ms.
     ///
     /// Between peers it is measured: the longest time from a position of the second peer's own hand
-    /// to the first step whose force has that position or a newer one. Between host and guest it is
+    /// to the first step whose force has that position or a newer one, and no number if that peer
+    /// holds nothing. Between host and guest it is
     /// computed. If the policy owns the model, it is one tick by construction: the guest's own copy
     /// answers at its next step (see [`pliant_stream::StreamedBody::predicted_hand`]). Otherwise it
     /// is half the round trip, half a step and the mean visual delay.

@@ -249,7 +249,8 @@ impl Experiment {
             second(seen.values().filter_map(|s| of_first(&s.reactions)).collect()) / force_scale.max(1e-12);
         f.true_ringing = second(agreed.reactions.range(first..).filter_map(|(_, r)| of_first(r)).collect())
             / force_scale.max(1e-12);
-        f.hand_to_force_ms = session.answered.as_secs_f64() * 1e3;
+        let own = self.hands.len() > 1;
+        f.hand_to_force_ms = if own { session.answered.as_secs_f64() * 1e3 } else { f64::NAN };
         f.recover_ms = longest.as_secs_f64() * 1e3;
         let [down, up] = *sent;
         f.bytes_per_frame = down.1 as f64 / down.0.max(1) as f64;

@@ -182,9 +182,10 @@ pub(super) fn elasticity(quick: bool) -> Result<(Vec<Figure>, String), LabError>
     let dear = settings.iter().map(|setting| setting.cost[0]).fold(0.0, f64::max);
     let _ = write!(
         text,
-        "\nWhat is *felt* decides: with linear elasticity the reaction is off by {:.0} % at best where the hand goes 8 % of the length (and by {:.0} % at worst: more modes do not help), and by {:.0} % at best at 28 %. With reduced elasticity and the patch's own shapes it is off by {:.1} and {:.1} % at best. What is *seen* at 28 % is off by {:.2} % of the length at best with linear elasticity, {:.2} % with reduced elasticity, and {:.2} % with the patch's own shapes. Linear elasticity begins at {:.0} us for a second of motion, and reduced elasticity with a hand takes up to {:.0} us, {:.1} % of one core. Linear elasticity stays the default, because it needs no material in the file, serves crowds, and is what bodies without hands need; a model that was baked with a material and that hands hold should be set to reduced elasticity, as `pliant pull` does by itself.\n",
+        "\nWhat is *felt* decides: with linear elasticity the reaction is off by {:.0} % at best where the hand goes 8 % of the length (and by {:.0} % at worst{}), and by {:.0} % at best at 28 %. With reduced elasticity and the patch's own shapes it is off by {:.1} and {:.1} % at best. What is *seen* at 28 % is off by {:.2} % of the length at best with linear elasticity, {:.2} % with reduced elasticity, and {:.2} % with the patch's own shapes. Linear elasticity begins at {:.0} us for a second of motion, and reduced elasticity with a hand takes up to {:.0} us, {:.1} % of one core. Linear elasticity stays the default, because it needs no material in the file, serves crowds, and is what bodies without hands need; a model that was baked with a material and that hands hold should be set to reduced elasticity, as `pliant pull` does by itself.\n",
         best(0, 0, 1),
         most(0, 0, 1),
+        if most(0, 0, 1) > best(0, 0, 1) { ": more modes do not help" } else { "" },
         best(0, 0, 2),
         best(2, 0, 1),
         best(2, 0, 2),

@@ -13,8 +13,8 @@ use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::{Processes, disturbed, network};
 use super::{
-    AGREES, Digest, END, Fault, FaultKind, HEALED, IDLE, LOOK, MAX_FORCE, MAX_MEMORY, Memory, Outcome, apart,
-    hand, hold, norm,
+    AGREES, Digest, END, FaultKind, HEALED, IDLE, LOOK, MAX_FORCE, MAX_MEMORY, Memory, Outcome,
+    SimulatedFault, apart, hand, hold, norm,
 };
 
 const BODY: BodyId = BodyId(1);
@@ -92,7 +92,7 @@ pub(super) fn run(
     model: &Arc<ModalModel>,
     seed: u64,
     count: usize,
-    faults: &[Fault],
+    faults: &[SimulatedFault],
     (mut random, mut memory): (Random, Memory),
 ) -> Result<Outcome, String> {
     let path = network(&mut random);
@@ -184,7 +184,7 @@ impl Mesh {
         Ok(session)
     }
 
-    fn begin(&mut self, fault: Fault) {
+    fn begin(&mut self, fault: SimulatedFault) {
         // Somebody has to stay who is in the session, and from whom the others get the state.
         let others = (0..self.malicious()).filter(|other| *other != fault.process);
         let started = |node: &Node| node.session.as_ref().is_some_and(|session| session.tick() > 0);

@@ -20,7 +20,7 @@ use pliant_mesh::shapes;
 use pliant_modal::{Damping, Element, GrabConfig, ModalModel};
 use serde::Serialize;
 
-pub use schedule::{Fault, FaultKind};
+pub use schedule::{FaultKind, SimulatedFault};
 
 use crate::{LabError, Progress};
 
@@ -202,7 +202,7 @@ fn session(
     seed: u64,
     model: &Arc<ModalModel>,
     probe: Option<fn() -> i64>,
-) -> (Vec<Fault>, Result<Outcome, String>) {
+) -> (Vec<SimulatedFault>, Result<Outcome, String>) {
     let mut random = schedule::Random::new(seed);
     let processes = 3 + random.index(2);
     let faults = schedule::schedule(&mut random, processes, FAULTS[0], FAULTS[1]);

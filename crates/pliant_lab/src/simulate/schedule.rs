@@ -100,7 +100,7 @@ impl FaultKind {
 
 /// One fault of a schedule.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Fault {
+pub struct SimulatedFault {
     /// When it begins.
     pub at: Duration,
     /// What happens.
@@ -111,7 +111,7 @@ pub struct Fault {
     pub lasts: Duration,
 }
 
-impl fmt::Display for Fault {
+impl fmt::Display for SimulatedFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (at, lasts) = (self.at.as_secs_f64(), self.lasts.as_secs_f64());
         write!(f, "{at:7.3} s  {:<17}  process {}  {lasts:.3} s", self.kind.name(), self.process)
@@ -120,9 +120,14 @@ impl fmt::Display for Fault {
 
 /// Draws the faults of a session in order of time. They begin between `from` and `to`, and the
 /// last of `processes` is malicious.
-pub(super) fn schedule(random: &mut Random, processes: usize, from: Duration, to: Duration) -> Vec<Fault> {
+pub(super) fn schedule(
+    random: &mut Random,
+    processes: usize,
+    from: Duration,
+    to: Duration,
+) -> Vec<SimulatedFault> {
     let span = u64::try_from((to.saturating_sub(from)).as_millis()).unwrap_or(1);
-    let mut faults: Vec<Fault> = (0..random.range(4, 13))
+    let mut faults: Vec<SimulatedFault> = (0..random.range(4, 13))
         .map(|_| {
             let at = from + random.millis(0, span);
             let kind = FaultKind::ALL[random.index(FaultKind::ALL.len())];
@@ -136,7 +141,7 @@ pub(super) fn schedule(random: &mut Random, processes: usize, from: Duration, to
                 FaultKind::Partition => random.millis(50, 6000),
                 FaultKind::Garbage | FaultKind::Replay | FaultKind::Flood => random.millis(100, 3000),
             };
-            Fault { at, kind, process, lasts }
+            SimulatedFault { at, kind, process, lasts }
         })
         .collect();
     faults.sort_by_key(|fault| fault.at);

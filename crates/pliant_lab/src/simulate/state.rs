@@ -5,12 +5,12 @@ use std::time::Duration;
 use pliant_stream::emulator::{LinkConfig, Loss};
 
 use super::schedule::Random;
-use super::{Fault, FaultKind, HEALED, LOOK};
+use super::{FaultKind, HEALED, LOOK, SimulatedFault};
 
 /// A fault that has begun.
 #[derive(Debug)]
 struct Begun {
-    fault: Fault,
+    fault: SimulatedFault,
     until: Duration,
     /// It has changed something.
     took: bool,
@@ -21,7 +21,7 @@ struct Begun {
 pub(super) struct Processes(Vec<Begun>);
 
 impl Processes {
-    pub(super) fn begin(&mut self, fault: Fault) {
+    pub(super) fn begin(&mut self, fault: SimulatedFault) {
         let until = (fault.at + fault.lasts).min(HEALED);
         self.0.push(Begun { fault, until, took: false });
     }

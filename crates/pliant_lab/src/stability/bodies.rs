@@ -213,7 +213,12 @@ pub(super) fn no_growth(growth: f64) -> Bound {
 /// only.
 pub(super) fn gain(what: &'static str, multiple: f64) -> Bound {
     // A number that is not finite stays so.
-    Bound::new(what, if multiple <= 1.0 { 0.0 } else { multiple - 1.0 }, 1e-9)
+    Bound::new(what, if multiple.is_finite() { (multiple - 1.0).max(0.0) } else { multiple }, 1e-9)
+}
+
+/// The largest of some numbers, or no number if one of them is none.
+pub(super) fn largest(numbers: impl Iterator<Item = f64>) -> f64 {
+    numbers.fold(f64::NEG_INFINITY, |a, b| if a.is_nan() || b.is_nan() { f64::NAN } else { a.max(b) })
 }
 
 /// A state from coordinates and velocities, with the matching accelerations.

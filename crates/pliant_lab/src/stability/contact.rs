@@ -10,7 +10,7 @@ use pliant_modal::{
 
 use super::{
     Bound, Case, CaseOutcome,
-    bodies::{BarBody, gain},
+    bodies::{BarBody, gain, largest},
 };
 use crate::{
     LabError,
@@ -76,8 +76,8 @@ fn energy(tick: &DropTick) -> f64 {
 /// the stored energy of the dents is uncertain where the contacts change.
 fn no_gain(ticks: &[DropTick]) -> Vec<Bound> {
     let start = ticks.first().map_or(f64::NAN, energy);
-    let most = ticks.iter().map(energy).fold(f64::NEG_INFINITY, f64::max);
-    let rise = ticks.windows(2).map(|w| (energy(&w[1]) - energy(&w[0])) / start).fold(0.0, f64::max);
+    let most = largest(ticks.iter().map(energy));
+    let rise = largest(ticks.windows(2).map(|w| (energy(&w[1]) - energy(&w[0])) / start));
     vec![
         gain("largest energy / energy at the start - 1", most / start),
         Bound::new("largest rise of the energy in a step / energy at the start", rise, 5e-4),
@@ -90,7 +90,7 @@ fn outcome(ticks: &[DropTick], mut bounds: Vec<Bound>) -> CaseOutcome {
 }
 
 fn deepest(ticks: &[DropTick]) -> f64 {
-    ticks.iter().map(|t| t.penetration).fold(0.0, f64::max)
+    largest(ticks.iter().map(|t| t.penetration))
 }
 
 /// The block falls by half its length and comes to rest. The ground then carries its weight.
