@@ -240,7 +240,7 @@ impl Request {
 fn ask(request: Request) -> impl FnOnce(&mut World) {
     move |world: &mut World| match world.get_resource_mut::<SessionControl>() {
         Some(mut control) => control.requests.push(request),
-        None => error!("there is no session without a NetPlugin"),
+        None => error!("there is no session without a NetPlugin: `app.add_plugins(NetPlugin::default())`"),
     }
 }
 
