@@ -413,7 +413,7 @@ fn no_peer_has_more_than_sixteen_hands_and_eight_impulses_at_a_tick() {
         other => panic!("{name}: {other:?}"),
     };
     refused(&hand, "held count");
-    refused(&blow, "impulse count");
+    refused(&impulse, "impulse count");
 }
 
 /// Runs every parser of external bytes and returns how many could read `bytes`. A value that was
