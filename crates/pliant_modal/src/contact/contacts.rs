@@ -127,9 +127,9 @@ impl ContactState {
     /// Largest force (N), coordinate of an anchor (m) and lost energy (J) that a state may have.
     pub const LARGEST: f64 = 1e9;
 
-    /// Whether all numbers are in their ranges, at most [`LARGEST`](Self::LARGEST), and each place is
-    /// there once, in the order of obstacles and sites. What has crossed a network is checked with
-    /// this.
+    /// Whether all numbers are in their ranges, at most [`LARGEST`](Self::LARGEST), and each place
+    /// is there once, in the order of obstacles and sites. What has crossed a network is checked
+    /// with this.
     pub fn is_valid(&self) -> bool {
         let place = |m: &ContactMemory| (m.obstacle, m.site);
         (0.5..=1.0).contains(&self.weight)
