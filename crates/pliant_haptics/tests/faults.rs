@@ -387,7 +387,7 @@ impl HapticDevice for Real {
 fn limits_that_limit_nothing_are_refused() {
     let real = || Real(VirtualDevice::new(VirtualConfig::touch(), HandModel::NONE).unwrap());
     let full = SafetyConfig::for_device(&real().info(), 1000.0);
-    let changes: [(&str, fn(&mut SafetyConfig)); 16] = [
+    let changes: [(&str, fn(&mut SafetyConfig)); 17] = [
         ("slew", |s| s.slew = Some(1e300)),
         // A force that may hardly change cannot fall either.
         ("slew", |s| s.slew = Some(1e-300)),
@@ -405,6 +405,9 @@ fn limits_that_limit_nothing_are_refused() {
             s.passivity = Some(PassivityConfig { max_damping: 1e3, ..Default::default() });
         }),
         ("max_damping", |s| s.max_damping = Some(1e300)),
+        ("thermal.continuous", |s| {
+            s.thermal = Some(ThermalConfig { continuous: 1e3, peak_seconds: 2.0 });
+        }),
         ("thermal.peak_seconds", |s| {
             s.thermal = Some(ThermalConfig { continuous: 0.5, peak_seconds: 1e9 });
         }),
