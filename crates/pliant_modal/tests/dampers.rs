@@ -69,6 +69,7 @@ fn a_damper_has_no_static_force() {
                 body.step().unwrap();
             }
             let [force, ..] = body.reaction(grabs[1]).unwrap();
+            println!("dampers of {first:.3} and {second:.3} s: {force:.4} N");
             assert!((force / EXPECTED - 1.0).abs() < 0.01, "{first} s and {second} s: {force} N");
         }
     }
