@@ -166,7 +166,7 @@ macro_rules! import {
 }
 
 import! {
-    BodyContacts, BodyFriction, BodyReady, BodyRefused, BodyState, ContactEnded,
+    BodyContacts, BodyFriction, BodyGravity, BodyGravityScale, BodyReady, BodyRefused, BodyState, ContactEnded,
     ContactLayers, ContactPlugin, ContactStarted, Driven, ForceArrow, Grab,
     GrabForce, GrabOf, Grabbed, Grabs, HapticButton, HapticDevices,
     HapticFault, HapticNotice, HapticTool, HapticsPlugin, Impulse, Inertia,

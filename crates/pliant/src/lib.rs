@@ -164,10 +164,11 @@ impl PluginGroup for PliantPlugins {
 pub mod prelude {
     pub use crate::PliantPlugins;
     pub use crate::body::{
-        BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed, Grabs, Impulse, Inertia,
-        Integrator, ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems,
-        PliantSystems, PliantTick, ProbeState, Push, Relaxation, Released, RideOn, RidingPlugin, SingleSteps,
-        StepSettings, SurfaceAnchor, SurfacePlace, Teleport, TouchProbe, VisualState,
+        BodyGravity, BodyGravityScale, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf,
+        Grabbed, Grabs, Impulse, Inertia, Integrator, ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin,
+        PliantDisplaySystems, PliantSystems, PliantTick, ProbeState, Push, Relaxation, Released, RideOn,
+        RidingPlugin, SingleSteps, StepSettings, SurfaceAnchor, SurfacePlace, Teleport, TouchProbe,
+        VisualState,
     };
     #[cfg(feature = "render")]
     pub use crate::body::{PliantGizmos, SurfaceDeformation, SurfaceDetail, SurfaceShading};

@@ -14,7 +14,7 @@ use pliant_modal::{
     Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings,
 };
 
-use crate::{Inertia, ModalAsset, VisualState, grab::GrabHold};
+use crate::{BodyGravityScale, Inertia, ModalAsset, VisualState, grab::GrabHold, gravity::Pull};
 
 /// A soft body: its model and its step settings.
 ///
@@ -43,13 +43,14 @@ use crate::{Inertia, ModalAsset, VisualState, grab::GrabHold};
 /// ([`BodyRefused`](crate::BodyRefused)), and the body keeps its previous settings.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Component, Debug, Default, Clone, PartialEq)]
-#[require(Transform, Visibility, Driven, Inertia)]
+#[require(Transform, Visibility, Driven, Inertia, BodyGravityScale)]
 pub struct ModalBody {
     /// The baked body. A new handle, or a new asset behind the handle, makes a new body at rest.
     /// Grabs stay if the new model has their vertex.
     pub model: Handle<ModalAsset>,
     /// Step settings: integrator, warping, gravity, damping, stiffness, relaxation. Gravity is in
-    /// world axes and world lengths.
+    /// world axes and world lengths, and adds to that of the scene
+    /// ([`BodyGravity`](crate::BodyGravity)).
     #[reflect(remote = ReflectedSettings)]
     pub settings: StepSettings,
     /// Level of detail: number of the model's modes that are kept, lowest first. Default: `None`,
@@ -137,17 +138,20 @@ impl ModalBody {
     }
 
     /// Returns the solver's configuration for a step of `step` seconds under a uniform scale of
-    /// `scale`.
-    pub(crate) fn config(&self, step: f64, scale: f64) -> BodyConfig {
+    /// `scale`, in a scene with this gravity.
+    pub(crate) fn config(&self, step: f64, scale: f64, pull: Pull) -> BodyConfig {
+        let gravity = self.pulled(pull).of_step(scale);
         BodyConfig {
-            settings: StepSettings {
-                gravity: self.settings.gravity.map(|acceleration| acceleration / scale),
-                ..self.settings
-            },
+            settings: StepSettings { gravity, ..self.settings },
             step,
             modes: self.modes,
             precision: if self.half_basis { Precision::Half } else { Precision::Single },
         }
+    }
+
+    /// Returns the gravity of the scene together with that of these settings.
+    pub(crate) fn pulled(&self, pull: Pull) -> Pull {
+        Pull { own: self.settings.gravity.into(), ..pull }
     }
 }
 
@@ -251,6 +255,8 @@ pub struct BodyState {
     #[reflect(ignore)]
     pub(crate) placed: Option<Affine3A>,
     #[reflect(ignore)]
+    pub(crate) pull: Pull,
+    #[reflect(ignore)]
     pub(crate) held: Vec<HeldBody>,
     /// Whether a step was refused and the warning was logged.
     pub(crate) faulted: bool,
@@ -283,6 +289,7 @@ impl BodyState {
             body,
             scale: 1.0,
             placed: None,
+            pull: Pull::default(),
             held: Vec::new(),
             faulted: false,
             quiet: 0.0,
@@ -311,7 +318,8 @@ impl BodyState {
     /// Returns the simulated body for changes, and wakes it.
     ///
     /// Configuration changes made here last until a field of the [`ModalBody`] changes, which sets
-    /// all of the configuration again. The caller must release grabs that the caller made here.
+    /// all of the configuration again. Gravity is also set again when that of the scene or the
+    /// scale of the entity changes. The caller must release grabs that the caller made here.
     /// Grabs of [`Grab`](crate::Grab) entities must not be changed here.
     pub fn body_mut(&mut self) -> &mut Body {
         self.wake();

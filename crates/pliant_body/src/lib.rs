@@ -22,6 +22,7 @@
 //! | `Transform`: the body's position, rotation and scale | [`VisualState`]: the state on screen |
 //! | [`Grab`] and [`GrabOf`] on a separate entity: a grab of a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
 //! | [`Impulse`], [`Push`] as messages: an impulse, N s; a force for one tick, N | [`BodyState::body`]: the result |
+//! | [`BodyGravity`] as a resource, [`BodyGravityScale`]: gravity of the scene, and a body's factor | |
 //! | [`Inertia`], [`RideOn`]: how strongly it feels its entity move, and a bone that it rides on | |
 //! | [`SurfaceAnchor`] on another entity: it sits on the surface | its `Transform` |
 //! | [`Driven::Remote`]: another source moves the body | [`PliantTick`]: the number of the step |
@@ -51,6 +52,7 @@ mod body;
 mod deform;
 mod error;
 mod grab;
+mod gravity;
 mod held;
 mod impulse;
 mod inertia;
@@ -90,6 +92,7 @@ pub use body::{BodyReady, BodyState, Driven, ModalBody, ModalBodyTemplate, NoPoi
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabbed, Grabs, Released};
+pub use gravity::{BodyGravity, BodyGravityScale};
 pub use held::HeldShapesCache;
 pub use impulse::{Impulse, Push};
 pub use inertia::{Inertia, Teleport};
@@ -206,6 +209,8 @@ impl Plugin for PliantBodyPlugin {
             .register_asset_reflect::<ModalAsset>()
             .init_asset_loader::<ModalAssetLoader>()
             .register_type::<ModalBody>()
+            .register_type::<BodyGravity>()
+            .register_type::<BodyGravityScale>()
             .register_type::<Driven>()
             .register_type::<NoPointerGrab>()
             .register_type::<Grab>()
@@ -226,6 +231,7 @@ impl Plugin for PliantBodyPlugin {
             .add_message::<SingleSteps>()
             .add_message::<Impulse>()
             .add_message::<Push>()
+            .init_resource::<BodyGravity>()
             .init_resource::<PliantTick>()
             .init_resource::<HeldShapesCache>()
             .insert_resource(step::Stepping { fixed })
@@ -256,6 +262,7 @@ impl Plugin for PliantBodyPlugin {
                         step::count_tick,
                         visual::begin_tick,
                         step::place_bodies,
+                        gravity::pull_bodies,
                         step::hold_bodies,
                         held::shape_held,
                         impulse::hit_bodies,

@@ -7,14 +7,14 @@ use bevy::{
         entity::{EntityMapper, MapEntities},
         reflect::{AppTypeRegistry, ReflectComponent},
     },
-    math::Affine3A,
+    math::{Affine3A, DVec3},
     prelude::*,
     reflect::{FromType, ReflectDeserialize, ReflectFromReflect, ReflectSerialize, TypeRegistry},
 };
 use pliant_modal::{Body, ModalModel, SavedBody, StepError};
 use serde::{Deserialize, Serialize};
 
-use crate::{BodyState, HeldShapesCache, ModalBody, body::HeldBody, grab::GrabHold};
+use crate::{BodyState, HeldShapesCache, ModalBody, body::HeldBody, grab::GrabHold, gravity::Pull};
 
 /// A [`BodyState`] as data. A world that is saved, as a `DynamicWorld` or otherwise by reflection,
 /// has it where the live world has a [`BodyState`].
@@ -35,6 +35,8 @@ pub struct SavedState {
     body: SavedBody,
     scale: f64,
     placed: Option<[f32; 12]>,
+    /// Gravity of its settings and of the scene, m/s^2.
+    pull: [[f64; 3]; 2],
     held: Vec<SavedGrab>,
     faulted: bool,
     quiet: f64,
@@ -88,6 +90,7 @@ impl SavedState {
             body: state.body.save(|id| saved.contains(&id)),
             scale: state.scale,
             placed: state.placed.map(|affine| affine.to_cols_array()),
+            pull: [state.pull.own.into(), state.pull.scene.into()],
             held: held.collect(),
             faulted: state.faulted,
             quiet: state.quiet,
@@ -105,7 +108,7 @@ impl SavedState {
     ) -> Option<Result<BodyState, StepError>> {
         let shapes = cache.get(model, self.body.shapes())?;
         let (settings, step) = self.body.settings();
-        let mut config = body.config(step, 1.0);
+        let mut config = body.config(step, 1.0, Pull::default());
         config.settings = *settings;
         let (restored, ids) = match Body::restore(model.clone(), config, &self.body, shapes) {
             Ok(restored) => restored,
@@ -117,10 +120,12 @@ impl SavedState {
             Some(HeldBody { entity: Entity::try_from_bits(held.entity)?, id, hold, waiting, refusing })
         });
         let scale = if self.scale.is_finite() && self.scale > 0.0 { self.scale } else { 1.0 };
+        let [own, scene] = self.pull.map(DVec3::from);
         let quiet = if self.quiet.is_finite() { self.quiet } else { 0.0 };
         Some(Ok(BodyState {
             scale,
             placed: self.placed.map(|cols| Affine3A::from_cols_array(&cols)),
+            pull: Pull { own, scene, asked: scene },
             held: held.collect(),
             faulted: self.faulted,
             quiet,

@@ -17,7 +17,7 @@ use pliant_modal::{
 use crate::{
     AWAKE_BODIES, BodyError, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed,
     Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, ProbeState, Released, STEP_TIME, SavedState,
-    TouchProbe, VisualState, body::HeldBody,
+    TouchProbe, VisualState, body::HeldBody, gravity::Pull,
 };
 
 /// The tick: the number of steps that the schedule of the bodies has made.
@@ -102,9 +102,10 @@ pub(crate) fn build_bodies(
             Some(state) if Arc::ptr_eq(state.model(), model) && state.body.mode_count() == modes => {
                 if body.is_changed() {
                     let mut state = state;
-                    let config = body.config(state.body.config().step, state.scale);
-                    if let Err(error) = state.body_mut().reconfigure(config) {
-                        refusals.report(&name, name.entity, BodyError::Build(error));
+                    let config = body.config(state.body.config().step, state.scale, state.pull);
+                    match state.body_mut().reconfigure(config) {
+                        Ok(()) => state.pull = body.pulled(state.pull),
+                        Err(error) => refusals.report(&name, name.entity, BodyError::Build(error)),
                     }
                 }
             }
@@ -113,7 +114,9 @@ pub(crate) fn build_bodies(
                 if same && !body.is_changed() {
                     continue;
                 }
-                match Body::new(model.clone(), body.config(step, 1.0)) {
+                // The first tick brings the scale and the gravity of the scene.
+                let pull = body.pulled(Pull::default());
+                match Body::new(model.clone(), body.config(step, 1.0, pull)) {
                     Ok(new) => {
                         // If only the number of modes changed, the motion of the common modes
                         // continues.
@@ -125,7 +128,7 @@ pub(crate) fn build_bodies(
                         // The entity may have been despawned in this frame.
                         commands
                             .entity(name.entity)
-                            .try_insert((BodyState::new(new), visual))
+                            .try_insert((BodyState { pull, ..BodyState::new(new) }, visual))
                             .try_remove::<BuildRefused>();
                         commands.trigger(BodyReady { entity: name.entity });
                     }
@@ -230,8 +233,7 @@ pub(crate) fn place_bodies(
             // The running configuration is the base, because the component's fields may have been
             // refused.
             let mut running = state.body.config().clone();
-            let shrink = state.scale / scale;
-            running.settings.gravity = running.settings.gravity.map(|acceleration| acceleration * shrink);
+            running.settings.gravity = state.pull.of_step(scale);
             match state.body_mut().reconfigure(running) {
                 Ok(()) => state.scale = scale,
                 Err(error) => {

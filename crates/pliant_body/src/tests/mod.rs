@@ -4,6 +4,7 @@
 mod baking;
 mod display;
 mod grabs;
+mod gravity;
 #[cfg(feature = "bake")]
 mod held;
 mod impulses;
