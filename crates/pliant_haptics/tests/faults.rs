@@ -440,7 +440,8 @@ impl HapticDevice for Bomb {
         self.inner.info()
     }
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
-        assert!(!self.panic.load(Ordering::Acquire), "the driver's own bug, on purpose");
+        // A loop that went on would have the device back.
+        assert!(!self.panic.swap(false, Ordering::AcqRel), "the driver's own bug, on purpose");
         self.inner.exchange(wrench, scheduler)
     }
     fn safe_stop(&mut self) {
@@ -504,4 +505,19 @@ fn a_driver_that_panics() {
         assert_eq!(heard, []);
         assert_eq!(running.report().state, LoopState::Ended);
     }
+}
+
+/// The app panics beside a device that works. The loop ends with its [`HapticLoop`], and leaves no
+/// force to the device's own watchdog.
+#[test]
+fn an_app_that_panics_ends_its_loop() {
+    let inner = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
+    let stopped = Arc::new(AtomicU32::new(0));
+    let bomb = Bomb { inner, panic: Arc::default(), stopped: stopped.clone(), twice: false };
+    let app = std::thread::spawn(move || {
+        let _running = HapticLoop::start(bomb, machine::patient()).unwrap();
+        panic!("the app's own bug, on purpose");
+    });
+    assert!(app.join().is_err());
+    assert_eq!(stopped.load(Ordering::Acquire), 1, "the device was told to let go");
 }

@@ -560,6 +560,27 @@ fn answer(device: &mut Inverse) -> Sample {
 }
 
 #[test]
+fn a_late_renewal_sends_zero_first() {
+    let service = Service::start(true);
+    let mut device = Inverse::open(second(service.config())).unwrap();
+    let pull = Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO };
+    let mut pulls = |device: &mut Inverse| {
+        machine::until("1 N on the motors", || {
+            let sample = device.exchange(&pull, &mut pacing());
+            let motor = service.desk().motor;
+            if sample.is_ok_and(|s| s.force_on) && motor == 1.0 { Ok(()) } else { Err(sample) }
+        });
+    };
+    pulls(&mut device);
+    std::thread::sleep(Duration::from_millis(40));
+    let late = device.exchange(&pull, &mut pacing()).unwrap();
+    let motor = service.desk().motor;
+    println!("Inverse: {motor} N after a late renewal");
+    assert_eq!((motor, late.force_on), (0.0, false), "a force that may be off comes back at zero");
+    pulls(&mut device);
+}
+
+#[test]
 fn a_late_answer_is_not_taken_for_the_next_one() {
     let service = Service::start(true);
     let mut device = hasty(&service);
@@ -659,6 +680,9 @@ fn a_service_that_does_not_answer_loses_its_force() {
     println!("Inverse: dropped after {took:.3} s");
     assert!(took <= 1.0, "{took} s");
     assert!(seconds_to_zero(&service) < 1.0, "no force is left behind");
+    // What a service does with the force of a closed connection is not published.
+    let zeros = service.desk().zeros;
+    assert_eq!(zeros, times.len() + 1, "each connection ends with a command without a force");
     service.desk().late = false;
 }
 

@@ -7,6 +7,7 @@
 use std::{
     ffi::{CString, c_char, c_int, c_uint, c_ulong},
     path::Path,
+    time::Duration,
 };
 
 use fakes::{ONE_HD, dhd, fake, force, hd, open_fake, place};
@@ -156,6 +157,36 @@ fn open_haptics_calibration_fault_and_return() {
     });
 }
 
+/// Sends 1 N, and 1 N again after a pause that is too long for the device's watchdog.
+fn renewed_late(device: &mut dyn HapticDevice, force: impl Fn() -> [f64; 3]) {
+    let pull = Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO };
+    let pulls = |device: &mut dyn HapticDevice| {
+        machine::until("1 N on the motors", || {
+            let sample = device.exchange(&pull, &mut pacing());
+            if sample.is_ok_and(|s| s.force_on) && force() != [0.0; 3] { Ok(()) } else { Err(sample) }
+        });
+    };
+    pulls(device);
+    std::thread::sleep(Duration::from_millis(40));
+    let late = device.exchange(&pull, &mut pacing()).unwrap();
+    let sent = force();
+    println!("{}: {sent:?} N after a late renewal", device.info().name);
+    assert_eq!((sent, late.force_on), ([0.0; 3], false), "a force that may be off comes back at zero");
+    pulls(device);
+}
+
+#[test]
+fn a_late_renewal_sends_zero_first() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let path = fake("hd", "late", &[]);
+    let library = open_fake(&path);
+    renewed_late(&mut OpenHaptics::open(hd(&path)).unwrap(), || force(&library));
+    // Without its own watchdog, the fake obeys whatever it is sent.
+    let path = fake("dhd", "late", &["-DWITHOUT_WATCHDOG"]);
+    let library = open_fake(&path);
+    renewed_late(&mut ForceDimension::open(dhd(&path)).unwrap(), || force(&library));
+}
+
 #[test]
 fn open_haptics_takes_all_errors_at_once_and_switches_the_force_off_on_its_way_out() {
     let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
@@ -167,6 +198,10 @@ fn open_haptics_takes_all_errors_at_once_and_switches_the_force_off_on_its_way_o
     call!(library, "fake_error_count", fn(c_int), 5);
     call!(library, "fake_error", fn(c_uint), 0x302);
     assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler), Err(Fault::Driver(0x302)));
+    // Of several errors the oldest is told, which the library returns last.
+    call!(library, "fake_first_error", fn(c_uint), 0x303);
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler), Err(Fault::Driver(0x303)));
+    call!(library, "fake_first_error", fn(c_uint), 0);
     call!(library, "fake_error", fn(c_uint), 0);
     let next = device.exchange(&Wrench::ZERO, &mut scheduler);
     assert!(next.is_ok(), "one bad frame is one error: {next:?}");

@@ -18,7 +18,7 @@ typedef unsigned int (*HDSchedulerCallback)(void *);
 struct state {
     double position[3], velocity[3], transform[16], force[3], pending[3], frame_at, patience;
     int made, buttons, open, current, running, in_frame, force_on, calibration, styles, switch_, has_switch;
-    unsigned int errors[64], each_frame;
+    unsigned int errors[64], each_frame, first_error;
     int depth, error_count, servo, hung, disabled, stops;
     unsigned long rate;
     long frames, forces;
@@ -93,6 +93,7 @@ void hdEndFrame(HHD h) {
     s.frame_at = now();
     if (s.force_on) memcpy((void *)s.force, (const void *)s.pending, sizeof s.force);
     feel();
+    if (s.first_error) fail(s.first_error);
     for (int i = 0; s.each_frame && i < s.error_count; i++) fail(s.each_frame);
 }
 void hdEnable(unsigned int what) { if (what == 0x4000 && s.current) s.force_on = 1; else fail(0x100); }
@@ -198,6 +199,8 @@ void fake_quarter_turn(void) { /* about x: y to z; column-major */
 void fake_another_is_current(void) { s.current = 0; }
 void fake_buttons(int b) { s.buttons = b; }
 void fake_error(unsigned int code) { s.each_frame = code; }
+/* Before those of each frame. */
+void fake_first_error(unsigned int code) { s.first_error = code; }
 void fake_error_count(int n) { s.error_count = n; }
 int fake_errors_left(void) { return s.depth; }
 void fake_calibration(int c) { s.calibration = c; }

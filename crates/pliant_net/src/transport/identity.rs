@@ -437,6 +437,35 @@ mod tests {
         std::fs::remove_dir_all(folder).unwrap();
     }
 
+    #[cfg(unix)]
+    #[test]
+    fn a_file_of_a_key_is_its_owners_only_from_the_first_moment() {
+        use std::os::unix::fs::PermissionsExt;
+        use std::sync::atomic::AtomicBool;
+        let path = std::env::temp_dir().join(format!("pliant_net-moment-{}", std::process::id()));
+        let (looks, done) = (AtomicU64::new(0), AtomicBool::new(false));
+        // One creates the file again and again, and the other looks at it all the time.
+        let modes = std::thread::scope(|scope| {
+            let look = scope.spawn(|| {
+                let mut modes = std::collections::BTreeSet::new();
+                while !done.load(Ordering::Acquire) {
+                    if let Ok(seen) = path.metadata() {
+                        modes.insert(seen.permissions().mode() & 0o777);
+                        looks.fetch_add(1, Ordering::AcqRel);
+                    }
+                }
+                modes
+            });
+            while looks.load(Ordering::Acquire) < 5000 {
+                drop(create_private(&path).unwrap());
+                fs::remove_file(&path).unwrap();
+            }
+            done.store(true, Ordering::Release);
+            look.join().unwrap()
+        });
+        assert_eq!(modes.into_iter().collect::<Vec<_>>(), [0o600]);
+    }
+
     #[test]
     fn all_who_make_a_key_at_the_same_moment_get_the_same_key() {
         let folder = std::env::temp_dir().join(format!("pliant_net-race-{}", std::process::id()));
