@@ -26,7 +26,7 @@
 //! | [`Inertia`], [`RideOn`]: how strongly it feels its entity move, and a bone that it rides on | |
 //! | [`SurfaceAnchor`] on another entity: it sits on the surface | its `Transform` |
 //! | [`Driven::Remote`]: another source moves the body | [`PliantTick`]: the number of the step |
-//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: sharp edges, level of detail, GPU or CPU (feature `render`) | [`BodyReady`], [`Grabbed`], [`Released`], [`BodyRefused`]: events on the body for observers; the last has a refused input with its error |
+//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`, `SurfacePart`: sharp edges, level of detail, GPU or CPU, several materials (feature `render`) | [`BodyReady`], [`Grabbed`], [`Released`], [`BodyRefused`]: events on the body for observers; the last has a refused input with its error |
 //!
 //! The crate does not depend on a network, a device, a viewer or a panel. Those crates depend on
 //! this one. The bodies follow Bevy's time: pausing `Time<Virtual>` pauses them, and
@@ -37,7 +37,8 @@
 //! `render`: draws the deformed surface as a mesh with normals, and draws the pointer's target.
 //! Without this feature no renderer is compiled.
 //!
-//! `bake`: adds `BakePlugin`, which meshes and bakes bodies inside the game from a `BakeRequest`.
+//! `bake`: adds `BakePlugin`, which meshes and bakes bodies inside the game from a `BakeRequest`
+//! or a `BakeNode`.
 //! Without this feature bodies are loaded from `.modal` files and no part of the bake is compiled.
 #![cfg_attr(
     test,
@@ -85,11 +86,11 @@ pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 #[cfg(feature = "bake")]
 pub use bake::{
     ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeBodyError, BakeExtrasError, BakeFailed,
-    BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage, Bakery,
+    BakeNode, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage, Bakery,
 };
 pub use body::{BodyReady, BodyState, Driven, ModalBody, ModalBodyTemplate, NoPointerGrab};
 #[cfg(feature = "render")]
-pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
+pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfacePart, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabbed, Grabs, Released};
 pub use gravity::{BodyGravity, BodyGravityScale};

@@ -1,10 +1,10 @@
 //! Anchors and materials that a modeling program has stored with a model.
 
-use pliant_bake::{Anchor, AnchorSyntax};
+use pliant_bake::{Anchor, AnchorSyntax, BakeConfig};
 use serde::Deserialize;
 use thiserror::Error;
 
-use super::BakeRequest;
+use super::{BakeNode, BakeRequest};
 
 /// Why the properties of a model do not say how to bake it.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -53,21 +53,37 @@ impl BakeRequest {
     /// # }
     /// ```
     pub fn with_extras(mut self, json: &str) -> Result<Self, BakeExtrasError> {
-        let unread = |error: serde_json::Error| BakeExtrasError::Json(error.to_string());
-        // A list would be read as the properties in their order.
-        let object: serde_json::Map<String, serde_json::Value> =
-            serde_json::from_str(json).map_err(unread)?;
-        let extras = Extras::deserialize(serde_json::Value::Object(object)).map_err(unread)?;
-        let anchors = match extras.anchor {
-            None => Vec::new(),
-            Some(Anchors::One(one)) => vec![one],
-            Some(Anchors::Many(many)) => many,
-        };
-        for anchor in anchors {
-            self.config.anchors.push(anchor.parse::<Anchor>()?);
-        }
-        self.config.young = extras.stiffness.unwrap_or(self.config.young);
-        self.config.density = extras.density.unwrap_or(self.config.density);
+        take(&mut self.config, json)?;
         Ok(self)
     }
+}
+
+impl BakeNode {
+    /// Takes anchors and material from the custom properties of the node, as
+    /// [`BakeRequest::with_extras`] does.
+    ///
+    /// # Errors
+    /// Returns the errors of [`BakeRequest::with_extras`].
+    pub fn with_extras(mut self, json: &str) -> Result<Self, BakeExtrasError> {
+        take(&mut self.config, json)?;
+        Ok(self)
+    }
+}
+
+fn take(config: &mut BakeConfig, json: &str) -> Result<(), BakeExtrasError> {
+    let unread = |error: serde_json::Error| BakeExtrasError::Json(error.to_string());
+    // A list would be read as the properties in their order.
+    let object: serde_json::Map<String, serde_json::Value> = serde_json::from_str(json).map_err(unread)?;
+    let extras = Extras::deserialize(serde_json::Value::Object(object)).map_err(unread)?;
+    let anchors = match extras.anchor {
+        None => Vec::new(),
+        Some(Anchors::One(one)) => vec![one],
+        Some(Anchors::Many(many)) => many,
+    };
+    for anchor in anchors {
+        config.anchors.push(anchor.parse::<Anchor>()?);
+    }
+    config.young = extras.stiffness.unwrap_or(config.young);
+    config.density = extras.density.unwrap_or(config.density);
+    Ok(())
 }

@@ -149,7 +149,7 @@ fn mesh(
             ((stuff(&**distance, &options, &mut progress)?, None), Own("a distance", None))
         }
         // A request begins when its mesh has become a surface.
-        BakeShape::Mesh(_) => {
+        BakeShape::Meshes(_) => {
             return Err(BakeBodyError::UnusableMesh { expected: "a mesh that is loaded" });
         }
         BakeShape::Input(input) => fill(Input::clone(input), &options, &mut progress)?,

@@ -3,6 +3,7 @@
 mod extras;
 mod from_mesh;
 mod job;
+mod node;
 mod request;
 
 use std::collections::VecDeque;
@@ -12,6 +13,7 @@ use pliant_bake::BakeCache;
 
 pub use extras::BakeExtrasError;
 pub use from_mesh::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS};
+pub use node::BakeNode;
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 
 use crate::{ModalAsset, ModalBody};
@@ -45,12 +47,13 @@ impl Default for BakePlugin {
 impl Plugin for BakePlugin {
     fn build(&self, app: &mut App) {
         app.register_type::<BakeRequest>()
+            .register_type::<BakeNode>()
             .register_type::<BakeFailed>()
             .register_type::<BakeProgress>()
             .register_type::<BakeStage>()
             .insert_resource(Bakery { cache: self.cache.clone(), waiting: VecDeque::new(), running: None })
             .add_observer(forget)
-            .add_systems(PreUpdate, (take_orders, work).chain());
+            .add_systems(PreUpdate, (node::bake_nodes, take_orders, work).chain());
     }
 }
 

@@ -46,10 +46,18 @@ impl BakeRequest {
         Self { shape, tets: 10_000, skin: BakeSkin::default(), config: BakeConfig::default() }
     }
 
-    /// Returns a request for a mesh of the engine, see [`BakeShape::Mesh`]. The mesh is also the
+    /// Returns a request for a mesh of the engine, see [`BakeShape::Meshes`]. The mesh is also the
     /// visible surface.
     pub fn mesh(mesh: Handle<Mesh>) -> Self {
-        Self { skin: BakeSkin::Shape, ..Self::new(BakeShape::Mesh(mesh)) }
+        Self::meshes([mesh])
+    }
+
+    /// Returns a request for several meshes of the engine that are one body, such as the primitives
+    /// of a glTF mesh. They are also the visible surface. [`BakeNode`](crate::BakeNode) makes such
+    /// a request of a node and keeps its materials.
+    pub fn meshes(meshes: impl IntoIterator<Item = Handle<Mesh>>) -> Self {
+        let shape = BakeShape::Meshes(meshes.into_iter().collect());
+        Self { skin: BakeSkin::Shape, ..Self::new(shape) }
     }
 
     /// Returns a request for a file, see [`BakeShape::File`].
@@ -65,16 +73,18 @@ pub enum BakeShape {
     /// parts (`.ron`) or tetrahedra (`.msh`, `.vtk`, `.mesh`, `.veg`). A defective surface is
     /// repaired. A relative path starts in the working directory, not in the asset folder.
     File(PathBuf),
-    /// A mesh of the engine, such as `assets.load("bird.glb#Mesh0/Primitive0")`, in its own space.
+    /// Meshes of the engine, such as `assets.load("bird.glb#Mesh0/Primitive0")`, in their own
+    /// space. Together they enclose the body.
     ///
-    /// The bake begins when the mesh is loaded. What is painted as [`ATTRIBUTE_STIFFNESS`],
+    /// The bake begins when they are loaded. Skins and morph targets have no effect on the shape.
+    /// What is painted as [`ATTRIBUTE_STIFFNESS`],
     /// [`ATTRIBUTE_DENSITY`] and [`ATTRIBUTE_ANCHOR`](super::ATTRIBUTE_ANCHOR) becomes the
-    /// request's [`BakeConfig::paint`], unless that is given. A later change of the mesh does not
-    /// start a new bake.
+    /// request's [`BakeConfig::paint`], unless that is given. A later change of a mesh does
+    /// not start a new bake.
     ///
     /// [`ATTRIBUTE_STIFFNESS`]: super::ATTRIBUTE_STIFFNESS
     /// [`ATTRIBUTE_DENSITY`]: super::ATTRIBUTE_DENSITY
-    Mesh(Handle<Mesh>),
+    Meshes(Vec<Handle<Mesh>>),
     /// A surface, a scene or tetrahedra in memory.
     Input(Arc<Input>),
     /// A signed distance function in code.
@@ -97,7 +107,7 @@ impl fmt::Debug for BakeShape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::File(path) => write!(f, "File({})", path.display()),
-            Self::Mesh(mesh) => f.debug_tuple("Mesh").field(mesh).finish(),
+            Self::Meshes(meshes) => f.debug_tuple("Meshes").field(meshes).finish(),
             Self::Input(_) => f.write_str("Input(..)"),
             Self::Distance(_) => f.write_str("Distance(..)"),
         }
@@ -184,10 +194,11 @@ pub enum BakeBodyError {
         /// The kind of the shape.
         got: &'static str,
     },
-    /// The mesh of a [`BakeShape::Mesh`] could not be loaded.
+    /// A mesh of a [`BakeShape::Meshes`] could not be loaded.
     #[error("the mesh of the body could not be loaded: {0}")]
     Load(String),
-    /// The mesh of a [`BakeShape::Mesh`] has no surface that can be filled.
+    /// A mesh of a [`BakeShape::Meshes`] has no triangles, or a [`BakeNode`](crate::BakeNode) has
+    /// no mesh.
     #[error("the body cannot be made from this mesh: expected {expected}")]
     UnusableMesh {
         /// What was expected.

@@ -9,6 +9,7 @@ mod cpu;
 mod detail;
 mod drawing;
 mod gpu;
+mod parts;
 mod topology;
 
 use std::{ops::Range, sync::Arc};
@@ -34,6 +35,7 @@ use gpu::{Compute, GpuShape};
 use topology::Topology;
 
 pub use detail::SurfaceDetail;
+pub use parts::SurfacePart;
 
 /// The shading of a body's surface. Every [`ModalBody`] has one.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
@@ -84,6 +86,7 @@ pub struct DrawnSurface {
 pub(crate) fn build(app: &mut App) {
     app.register_type::<SurfaceShading>()
         .register_type::<SurfaceDetail>()
+        .register_type::<SurfacePart>()
         .register_type::<SurfaceDeformation>()
         .register_required_components::<ModalBody, SurfaceShading>()
         .register_required_components::<ModalBody, SurfaceDetail>()
@@ -94,7 +97,7 @@ pub(crate) fn build(app: &mut App) {
         .add_systems(
             PostUpdate,
             (
-                (make_meshes, deform_surfaces)
+                (make_meshes, deform_surfaces, parts::draw_parts)
                     .chain()
                     .in_set(PliantDisplaySystems::Deform)
                     // These systems read the visibility of the frame before. Bevy computes the
