@@ -216,6 +216,8 @@ pub mod book {
     pub struct BakingPage;
     #[doc = include_str!("../../../docs/contact.md")]
     pub struct ContactPage;
+    #[doc = include_str!("../../../docs/blender.md")]
+    pub struct BlenderPage;
     #[doc = include_str!("../../../docs/multiuser.md")]
     pub struct MultiuserPage;
     #[doc = include_str!("../../../docs/devices.md")]
