@@ -5,12 +5,21 @@
 #[path = "blender/mod.rs"]
 mod bud;
 
+use std::{fs, path::Path, time::Duration};
+
 use bevy::{
+    asset::{
+        AssetMode, LoadState,
+        processor::{AssetProcessor, FileTransactionLogFactory},
+    },
     gltf::GltfMaterialName,
     mesh::{VertexAttributeValues, skinning::SkinnedMesh},
     prelude::*,
 };
-use pliant::{body::SurfacePart, prelude::*};
+use pliant::{
+    body::{BakePlugin, SurfacePart},
+    prelude::*,
+};
 
 /// The rows of a part's mesh: positions.
 fn positions(app: &App, part: Entity) -> Vec<Vec3> {
@@ -72,4 +81,77 @@ fn a_file_becomes_a_body_with_both_of_its_materials() {
     let q = app.world().get::<BodyState>(body).unwrap().body().q();
     assert!(q.iter().any(|q| q.abs() > 1e-3), "{q:?}");
     assert_eq!(positions(&app, parts[0]), positions(&app, parts[1]), "one surface");
+}
+
+/// Returns an app that loads the processed assets of a folder, and processes them first if it can.
+fn processed(folder: &Path, process: bool) -> App {
+    let text = |name: &str| folder.join(name).to_string_lossy().into_owned();
+    let mut app = App::new();
+    app.add_plugins((
+        MinimalPlugins,
+        AssetPlugin {
+            file_path: text("assets"),
+            processed_file_path: text("imported"),
+            mode: AssetMode::Processed,
+            use_asset_processor_override: Some(process),
+            ..default()
+        },
+        TransformPlugin,
+        PliantBodyPlugin::default(),
+    ));
+    // A game that only loads what was processed does not know how to bake.
+    if process {
+        app.add_plugins(BakePlugin { cache: None });
+        let log = FileTransactionLogFactory { file_path: folder.join("imported/log") };
+        app.world().resource::<AssetProcessor>().data().set_log_factory(Box::new(log)).unwrap();
+    }
+    app
+}
+
+/// Loads the file as a baked body.
+fn load(app: &mut App, name: &'static str) -> Result<ModalAsset, String> {
+    let handle: Handle<ModalAsset> = app.world().resource::<AssetServer>().load(name);
+    for _ in 0..60_000 {
+        app.update();
+        if let Some(model) = app.world().resource::<Assets<ModalAsset>>().get(&handle) {
+            return Ok(model.clone());
+        }
+        if let LoadState::Failed(error) = app.world().resource::<AssetServer>().load_state(&handle) {
+            return Err(error.to_string());
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    panic!("{name} has not come");
+}
+
+#[test]
+fn a_file_is_baked_when_assets_are_processed() {
+    let folder = std::env::temp_dir().join(format!("pliant-processed-{}", std::process::id()));
+    let assets = folder.join("assets");
+    fs::create_dir_all(&assets).unwrap();
+    let glb = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/blender/bud.glb");
+    let meta = |settings: &str| {
+        format!(
+            "(meta_format_version: \"1.0\", asset: Process(processor: \"BakeProcessor\", settings: {settings}))"
+        )
+    };
+    fs::copy(&glb, assets.join("bud.glb")).unwrap();
+    let settings = r#"(tets: 2000, modes: 8, young: 2e4, density: 400, anchors: ["y<0.08"])"#;
+    fs::write(assets.join("bud.glb.meta"), meta(settings)).unwrap();
+    fs::copy(&glb, assets.join("bad.glb")).unwrap();
+    fs::write(assets.join("bad.glb.meta"), meta(r#"(anchors: ["left"])"#)).unwrap();
+
+    let mut app = processed(&folder, true);
+    let ModalAsset(baked) = load(&mut app, "bud.glb").unwrap();
+    assert_eq!((baked.mode_count(), baked.is_free()), (8, false));
+    assert_eq!(baked.surface().triangles().len(), 720, "the surface of the file");
+    assert!(baked.surface().uvs().is_some());
+    println!("processed: {} tetrahedra, {:.3} kg", baked.info().tets, baked.mass());
+    let error = load(&mut app, "bad.glb").unwrap_err();
+    println!("{error}");
+    drop(app);
+    // What was processed is loaded by an app that cannot bake.
+    let ModalAsset(shipped) = load(&mut processed(&folder, false), "bud.glb").unwrap();
+    assert_eq!(shipped.hash(), baked.hash());
+    fs::remove_dir_all(&folder).unwrap();
 }

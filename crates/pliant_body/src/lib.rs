@@ -38,7 +38,7 @@
 //! Without this feature no renderer is compiled.
 //!
 //! `bake`: adds `BakePlugin`, which meshes and bakes bodies inside the game from a `BakeRequest`
-//! or a `BakeNode`.
+//! or a `BakeNode`, and bakes files when assets are processed.
 //! Without this feature bodies are loaded from `.modal` files and no part of the bake is compiled.
 #![cfg_attr(
     test,
@@ -86,7 +86,8 @@ pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 #[cfg(feature = "bake")]
 pub use bake::{
     ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeBodyError, BakeExtrasError, BakeFailed,
-    BakeNode, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage, Bakery,
+    BakeNode, BakePlugin, BakeProcessor, BakeProgress, BakeRequest, BakeSettings, BakeShape, BakeSkin,
+    BakeStage, Bakery,
 };
 pub use body::{BodyReady, BodyState, Driven, ModalBody, ModalBodyTemplate, NoPointerGrab};
 #[cfg(feature = "render")]

@@ -4,6 +4,7 @@ mod extras;
 mod from_mesh;
 mod job;
 mod node;
+mod process;
 mod request;
 
 use std::collections::VecDeque;
@@ -14,6 +15,7 @@ use pliant_bake::BakeCache;
 pub use extras::BakeExtrasError;
 pub use from_mesh::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS};
 pub use node::BakeNode;
+pub use process::{BakeProcessor, BakeSettings};
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 
 use crate::{ModalAsset, ModalBody};
@@ -46,7 +48,8 @@ impl Default for BakePlugin {
 
 impl Plugin for BakePlugin {
     fn build(&self, app: &mut App) {
-        app.register_type::<BakeRequest>()
+        app.register_asset_processor(BakeProcessor)
+            .register_type::<BakeRequest>()
             .register_type::<BakeNode>()
             .register_type::<BakeFailed>()
             .register_type::<BakeProgress>()

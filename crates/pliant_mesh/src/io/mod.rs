@@ -114,6 +114,22 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
 /// error in the file.
 pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
     let path = path.as_ref();
+    surface_of(path, || bytes(path))
+}
+
+/// Reads a triangle surface from the bytes of a file, as [`read_surface`] does. The extension of
+/// `path` determines the format, and the other files of a `.gltf` are looked for beside it.
+///
+/// # Errors
+/// Returns the errors of [`read_surface`].
+pub fn parse_surface(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Surface, MeshError> {
+    surface_of(path.as_ref(), || Ok(bytes))
+}
+
+fn surface_of<B: AsRef<[u8]>>(
+    path: &Path,
+    bytes: impl FnOnce() -> Result<B, MeshError>,
+) -> Result<Surface, MeshError> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let parse: &dyn Fn(&[u8]) -> Result<Surface, MeshError> = match extension(path).as_str() {
         "obj" => &obj::parse,
@@ -122,9 +138,9 @@ pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
         "gltf" | "glb" => &|bytes| gltf::parse(bytes, folder),
         _ => return Err(unknown(path, SURFACES)),
     };
-    let bytes = bytes(path)?;
+    let bytes = bytes()?;
     in_file(path, || {
-        let surface = parse(&bytes)?;
+        let surface = parse(bytes.as_ref())?;
         surface.check()?;
         Ok(surface)
     })
