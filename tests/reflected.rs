@@ -11,7 +11,7 @@ use bevy::{
         schedule::ScheduleLabel,
     },
     prelude::*,
-    reflect::ReflectFromReflect,
+    reflect::{ReflectFromReflect, prelude::ReflectDefault},
     transform::TransformPlugin,
 };
 use pliant::{
@@ -109,6 +109,8 @@ fn every_public_component_and_resource_is_registered() {
                         (kind == "Component" || found.contains::<ReflectResource>())
                             && found.contains::<ReflectComponent>()
                             && found.contains::<ReflectFromReflect>()
+                            // An inspector adds them, and a saved world may leave out a field.
+                            && found.contains::<ReflectDefault>()
                     }
                     _ => true,
                 });

@@ -83,9 +83,16 @@ impl GrabHold {
 
 /// The body that a grab holds.
 #[derive(Component, FromTemplate, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[relationship(relationship_target = Grabs)]
 pub struct GrabOf(#[entities] pub Entity);
+
+impl Default for GrabOf {
+    /// Holds no body.
+    fn default() -> Self {
+        Self(Entity::PLACEHOLDER)
+    }
+}
 
 /// The grabs on a body, oldest first. Despawning the body also despawns its grabs.
 #[derive(Component, Reflect, Debug, Default)]

@@ -56,7 +56,7 @@ pub struct PointerGrabSystems;
 
 /// Marks a grab that a pointer made.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Component, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct PointerHeld {
     /// The pointer that holds the body.
     pub pointer: PointerId,
@@ -69,6 +69,14 @@ pub struct PointerHeld {
     pub offset: DVec3,
     /// Radius of the sphere drawn at the target, m.
     pub mark: f32,
+}
+
+impl Default for PointerHeld {
+    /// The mouse, and no camera.
+    fn default() -> Self {
+        let (pointer, camera) = (PointerId::default(), Entity::PLACEHOLDER);
+        Self { pointer, camera, hit: Vec3::ZERO, offset: DVec3::ZERO, mark: 0.0 }
+    }
 }
 
 impl Plugin for PointerGrabPlugin {

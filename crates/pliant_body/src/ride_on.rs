@@ -28,7 +28,7 @@ use crate::Teleport;
 /// # #[derive(Component)] struct WorldAssetRoot;
 /// ```
 #[derive(Component, FromTemplate, Reflect, Debug, Clone, PartialEq, Eq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[require(Transform)]
 pub struct RideOn {
     /// Entity at or below which the named one is looked for.
@@ -36,6 +36,13 @@ pub struct RideOn {
     pub root: Entity,
     /// Name of the entity to ride on.
     pub name: String,
+}
+
+impl Default for RideOn {
+    /// Waits for no entity.
+    fn default() -> Self {
+        Self { root: Entity::PLACEHOLDER, name: String::new() }
+    }
 }
 
 /// Gives the entities that wait their parents. To be put there is no motion that a body feels.

@@ -30,7 +30,7 @@ use crate::{BodyError, BodyState, VisualState, step::Refusals};
 /// }
 /// ```
 #[derive(Component, FromTemplate, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[require(Transform)]
 pub struct SurfaceAnchor {
     /// The body.
@@ -38,6 +38,13 @@ pub struct SurfaceAnchor {
     pub body: Entity,
     /// The place on its surface.
     pub place: SurfacePlace,
+}
+
+impl Default for SurfaceAnchor {
+    /// Follows no body.
+    fn default() -> Self {
+        Self { body: Entity::PLACEHOLDER, place: SurfacePlace::default() }
+    }
 }
 
 /// A place on the surface of a body.

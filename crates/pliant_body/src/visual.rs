@@ -31,8 +31,8 @@ pub struct Pose {
 /// Every state has one coordinate per kept mode, kg^1/2 m.
 ///
 /// A saved state has no own shapes of held patches. The next tick pushes them again.
-#[derive(Component, Reflect, Debug, Default)]
-#[reflect(Component, Debug, Default)]
+#[derive(Component, Reflect, Debug, Default, Clone)]
+#[reflect(Component, Debug, Default, Clone)]
 pub struct VisualState {
     // The three vectors have the same length. Nothing outside may change the length of one of them.
     previous: Vec<f64>,
@@ -44,14 +44,14 @@ pub struct VisualState {
     /// Fraction of the tick to which the state was interpolated since the last push.
     at: Option<f64>,
     version: u64,
-    #[reflect(ignore)]
+    #[reflect(ignore, clone)]
     held: Option<HeldColumns>,
     /// Previous and current pose of a free body. An anchored body is at its transform.
     poses: Option<[Pose; 2]>,
 }
 
 /// What the own shapes of held patches add to the states.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct HeldColumns {
     shapes: Arc<HeldShapes>,
     previous: Vec<f64>,

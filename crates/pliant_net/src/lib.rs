@@ -32,7 +32,7 @@
 //! | [`SharedBody`] on a body of the host | [`NetStats`]: round trip, loss, repair, rates |
 //! | [`Grab`](pliant_body::Grab) and [`GrabOf`](pliant_body::GrabOf), on guests and on the host | [`GrabForce`](pliant_body::GrabForce): the reaction, in step with the displayed shape |
 //! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: the users, the quality of their connections, their grabs |
-//! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages |
+//! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages, and events for observers |
 //! | [`Interest`] on a guest's body: how many modes the guest wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`], [`SessionFailed`]: messages, and events for observers |
 //! | [`SessionCommands`]: sessions that begin and end while the app runs, also over the app's own [`Carrier`] | [`SessionState`]: a resource |
 //! | | [`RemoteHands`] on a guest's bodies: where the other users' hands are |

@@ -55,8 +55,8 @@ pub struct RemoteHand {
 #[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct RemoteHands(pub Vec<RemoteHand>);
 
-/// A body of the host has arrived.
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// A body of the host has arrived. A message, and an event on the body's entity for observers.
+#[derive(Message, EntityEvent, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct BodyArrived {
     /// The entity of the body, with [`RemoteBody`], [`ModalBody`](pliant_body::ModalBody) and
@@ -69,8 +69,9 @@ pub struct BodyArrived {
 /// The host has removed a body from the session. An entity that the plugin spawned for the body is
 /// despawned. An entity of the app stays, in the state in which it was last displayed, until the
 /// app leaves the session
-/// ([`SessionCommands::leave_session`](crate::SessionCommands::leave_session)).
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// ([`SessionCommands::leave_session`](crate::SessionCommands::leave_session)). A message, and an
+/// event on the body's entity for observers.
+#[derive(Message, EntityEvent, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct BodyLeft {
     /// The entity of the body.
@@ -80,8 +81,9 @@ pub struct BodyLeft {
 }
 
 /// The host has refused one of this app's grabs, or has taken it off the body. Despawn the grab, or
-/// change its vertex or radius to try again.
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// change its vertex or radius to try again. A message, and an event on the grab's entity for
+/// observers.
+#[derive(Message, EntityEvent, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct GrabRefused {
     /// The entity of the grab.

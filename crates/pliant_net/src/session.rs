@@ -17,8 +17,12 @@ use crate::host::{self, HostConfig, NetHost};
 use crate::peer::{self, NetPeer, PeerConfig, PeerState};
 use crate::plugin::NetError;
 use crate::recording::SessionRecording;
-use crate::remote::{RemoteBody, RemoteHands, SessionClosed, SessionFailed, SessionJoined, SessionLost};
+use crate::remote::{
+    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHands, SessionClosed, SessionFailed, SessionJoined,
+    SessionLost,
+};
 use crate::transport::{Carrier, Endpoint, Invite, MeshCarrier, TransportError, quic};
+use crate::user::{UserJoined, UserLeft};
 
 /// Begins and leaves sessions while the app runs. The app needs a
 /// [`NetPlugin`](crate::NetPlugin), which may begin without a session.
@@ -250,6 +254,11 @@ pub(crate) enum SessionEvent {
     Lost(SessionLost),
     Closed(SessionClosed),
     Failed(SessionFailed),
+    BodyArrived(BodyArrived),
+    BodyLeft(BodyLeft),
+    GrabRefused(GrabRefused),
+    UserJoined(UserJoined),
+    UserLeft(UserLeft),
 }
 
 impl SessionEvent {
@@ -499,6 +508,11 @@ fn publish_events(world: &mut World) {
             SessionEvent::Joined(event) => publish(world, event),
             SessionEvent::Lost(event) => publish(world, event),
             SessionEvent::Closed(event) => publish(world, event),
+            SessionEvent::BodyArrived(event) => publish(world, event),
+            SessionEvent::BodyLeft(event) => publish(world, event),
+            SessionEvent::GrabRefused(event) => publish(world, event),
+            SessionEvent::UserJoined(event) => publish(world, event),
+            SessionEvent::UserLeft(event) => publish(world, event),
             SessionEvent::Failed(event) => {
                 warn!("there is no session: {}", event.reason);
                 publish(world, event);

@@ -10,7 +10,7 @@ use crate::transport::Role;
 
 /// A user of the session. Every app has one entity for each user, including its own ([`Yourself`]).
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct User {
     /// The number that the host gave the user. The user at the host is [`UserId::HOST`].
     #[reflect(remote = ReflectedUserId)]
@@ -30,6 +30,13 @@ impl UserLink {
     pub(crate) fn of(link: &UserLinkInfo) -> Self {
         let [loss_in, loss_out] = link.losses();
         Self { round_trip: link.round_trip(), loss_in, loss_out }
+    }
+}
+
+impl Default for User {
+    /// The user at the host, without a name.
+    fn default() -> Self {
+        Self::new(UserId::HOST, "", Role::default())
     }
 }
 
@@ -83,10 +90,17 @@ pub struct UserLink {
 
 /// The user whose hand a [`Grab`](pliant_body::Grab) is. Despawning the entity on a host ends a
 /// guest's grab, and the guest receives [`GrabRefused`](crate::GrabRefused).
-#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[derive(Component, FromTemplate, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[relationship(relationship_target = Hands)]
 pub struct HandOf(#[entities] pub Entity);
+
+impl Default for HandOf {
+    /// The hand of no user.
+    fn default() -> Self {
+        Self(Entity::PLACEHOLDER)
+    }
+}
 
 /// The grabs of a user, oldest first. They are despawned with the user.
 #[derive(Component, Reflect, Debug, Default)]
@@ -94,8 +108,8 @@ pub struct HandOf(#[entities] pub Entity);
 #[relationship_target(relationship = HandOf, linked_spawn)]
 pub struct Hands(Vec<Entity>);
 
-/// A user has joined.
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// A user has joined. A message, and an event on the user's entity for observers.
+#[derive(Message, EntityEvent, Reflect, Debug, Clone, PartialEq)]
 #[reflect(opaque)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct UserJoined {
@@ -109,8 +123,8 @@ pub struct UserJoined {
     pub back: bool,
 }
 
-/// A user has left. The entity is despawned.
-#[derive(Message, Reflect, Debug, Clone, PartialEq)]
+/// A user has left. The entity is despawned. A message, and an event for observers.
+#[derive(Message, Event, Reflect, Debug, Clone, PartialEq)]
 #[reflect(opaque)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct UserLeft {

@@ -17,8 +17,8 @@ use pliant_body::{
 use pliant_modal::{ModalModel, ObstacleShape, Plane};
 use pliant_net::transport::{Carrier, Emulation, Endpoint, Event, JoinOptions, PeerId};
 use pliant_net::{
-    BodyLeft, GrabRefused, GuestState, HandOf, Holding, HostConfig, JoinConfig, NetGuest, NetStats,
-    RemoteBody, RemoteHands, SharedBody, User, UserLeft, UserLink,
+    BodyArrived, BodyLeft, GrabRefused, GuestState, HandOf, Holding, HostConfig, JoinConfig, NetGuest,
+    NetHost, NetStats, RemoteBody, RemoteHands, SharedBody, User, UserJoined, UserLeft, UserLink, Yourself,
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::Preset;
@@ -383,6 +383,64 @@ fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
         must!(at_host < 0.8 && at_guest < 0.8, "at the host {at_host}, at the guest {at_guest}");
         println!("at the host {at_host:.3}, at the guest {at_guest:.3}");
         Ok(())
+    });
+}
+
+#[derive(Resource, Default)]
+struct Observed(Vec<String>);
+
+/// Notes the events of users, bodies and grabs. The session is there when they are observed.
+fn observe(app: &mut App) {
+    fn note(what: &str, of: Entity, observed: &mut Observed) {
+        observed.0.push(format!("{what} {of}"));
+    }
+    app.init_resource::<Observed>()
+        .add_observer(|of: On<UserJoined>, _: Res<NetHost>, mut o: ResMut<Observed>| {
+            note("joined", of.entity, &mut o);
+        })
+        .add_observer(|of: On<UserLeft>, _: Res<NetHost>, mut o: ResMut<Observed>| {
+            o.0.push(format!("left {}", of.name));
+        })
+        .add_observer(|of: On<BodyArrived>, _: Res<NetGuest>, mut o: ResMut<Observed>| {
+            note("arrived", of.entity, &mut o);
+        })
+        .add_observer(|of: On<BodyLeft>, _: Res<NetGuest>, mut o: ResMut<Observed>| {
+            note("gone", of.entity, &mut o);
+        });
+}
+
+#[test]
+fn users_bodies_and_refused_grabs_are_events_for_observers() {
+    let _alone = alone();
+    let (mut host, invite, hosted) = host(HostConfig::default());
+    observe(&mut host);
+    let mut guest = guest(&invite, JoinConfig { name: "Ann".into(), ..JoinConfig::default() });
+    observe(&mut guest);
+    let body = arrival(&mut host, &mut guest);
+    assert_eq!(guest.world().resource::<Observed>().0, [format!("arrived {body}")]);
+    let mut users = host.world_mut().query_filtered::<Entity, (With<User>, Without<Yourself>)>();
+    let user = users.single(host.world()).unwrap();
+    assert_eq!(host.world().resource::<Observed>().0, [format!("joined {user}")]);
+    // The host takes the guest's hand off the body, and an observer of that grab is told.
+    let refused = guest.world_mut().spawn((Grab::new(TIP, 0.2, DVec3::Y), GrabOf(body))).id();
+    guest.world_mut().entity_mut(refused).observe(
+        |of: On<GrabRefused>, _: Res<NetGuest>, mut observed: ResMut<Observed>| {
+            observed.0.push(format!("refused {}", of.entity));
+        },
+    );
+    run_until(&mut [&mut host, &mut guest], "the guest holds", |apps| only::<HandOf>(apps[0]).is_some());
+    let hand = only::<HandOf>(&mut host).unwrap();
+    host.world_mut().despawn(hand);
+    run_until(&mut [&mut host, &mut guest], "the grab is refused", |apps| {
+        apps[1].world().resource::<Observed>().0.last() == Some(&format!("refused {refused}"))
+    });
+    host.world_mut().despawn(hosted);
+    run_until(&mut [&mut host, &mut guest], "the body is gone", |apps| {
+        apps[1].world().resource::<Observed>().0.last() == Some(&format!("gone {body}"))
+    });
+    drop(guest);
+    run_until(&mut [&mut host], "the guest has left", |apps| {
+        apps[0].world().resource::<Observed>().0.last() == Some(&"left Ann".to_owned())
     });
 }
 

@@ -11,8 +11,15 @@ use crate::{
 
 /// Identifies a device among the [`HapticDevices`]. An identifier is never used twice.
 #[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-#[reflect(Debug, Clone, PartialEq, Hash)]
+#[reflect(Debug, Default, Clone, PartialEq, Hash)]
 pub struct DeviceId(u32);
+
+impl Default for DeviceId {
+    /// No device.
+    fn default() -> Self {
+        Self(u32::MAX)
+    }
+}
 
 /// The haptic devices in use. Each device runs its loop on its own thread until the app removes the
 /// device.

@@ -60,12 +60,20 @@ impl VibrationOutput for GamepadVibration {
 /// Makes a gamepad vibrate in proportion to the force of its tool. The vibration is only a hint of
 /// the force and has no direction.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Component, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct ToolRumble {
     /// The gamepad's entity.
+    #[entities]
     pub gamepad: Entity,
     /// Force at which the gamepad vibrates at full strength, N. Default: 3.
     pub full: f64,
+}
+
+impl Default for ToolRumble {
+    /// For no gamepad, with full strength at 3 N.
+    fn default() -> Self {
+        Self::new(Entity::PLACEHOLDER)
+    }
 }
 
 impl ToolRumble {

@@ -18,7 +18,7 @@ const STIFFEST: f64 = 1e5;
 /// The entity's transform places the center of the device's workspace in the world and turns it.
 /// The transform's scale has no effect, see [`motion_scale`](Self::motion_scale).
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Component, Clone, PartialEq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[require(Transform, ToolPose)]
 pub struct HapticTool {
     /// The device.
@@ -39,6 +39,13 @@ pub struct HapticTool {
     /// Whether the loop steps a copy of the held body itself. This gives finer forces that do not
     /// depend on the simulation's rate. Default: `false`.
     pub modal: bool,
+}
+
+impl Default for HapticTool {
+    /// The tool of no device, with default settings.
+    fn default() -> Self {
+        Self::new(DeviceId::default())
+    }
 }
 
 impl HapticTool {
@@ -114,15 +121,22 @@ pub struct ToolPose {
 
 /// The tool that holds a [`Grab`]. The plugin then writes the grab's target, stiffness and
 /// relaxation.
-#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
-#[reflect(Component, Clone, PartialEq)]
+#[derive(Component, FromTemplate, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Debug, Default, Clone, PartialEq)]
 #[relationship(relationship_target = ToolGrabs)]
 pub struct HeldBy(#[entities] pub Entity);
+
+impl Default for HeldBy {
+    /// Held by no tool.
+    fn default() -> Self {
+        Self(Entity::PLACEHOLDER)
+    }
+}
 
 /// The grabs of a tool, oldest first. The first [`MAX_CONTACTS`](crate::MAX_CONTACTS) exert a
 /// force. All of them are despawned with the tool.
 #[derive(Component, Reflect, Debug, Default)]
-#[reflect(Component)]
+#[reflect(Component, Debug, Default)]
 #[relationship_target(relationship = HeldBy, linked_spawn)]
 pub struct ToolGrabs(Vec<Entity>);
 

@@ -234,7 +234,7 @@ impl NetGuest {
                     let refused = self.grabs.iter_mut().find(|(_, sent)| sent.own.number == Some(grab));
                     if let Some((&entity, sent)) = refused {
                         sent.own.number = None;
-                        world.write_message(GrabRefused { entity });
+                        tell(world, SessionEvent::GrabRefused(GrabRefused { entity }));
                     }
                 }
                 // Both ends have stopped receiving from each other, so the guest connects again.
