@@ -65,6 +65,7 @@
 //! | `picking` | yes | Bevy's picking, with which pointers drag the bodies |
 //! | `contact` | no | obstacles that bodies touch, and bodies that touch each other |
 //! | `contact-mesh` | no | convex hulls and triangle meshes as obstacles |
+//! | `contact-avian` | no | colliders and rigid bodies of avian3d 0.7, with forces both ways |
 //! | `net` | no | sessions over QUIC |
 //! | `states` | no | the state of the session as a state of Bevy, with `net` |
 //! | `haptics` | no | haptic devices and the device loop |
@@ -205,6 +206,7 @@ pub struct Readme;
     feature = "rerun",
     feature = "panel",
     feature = "contact-mesh",
+    feature = "contact-avian",
     feature = "bake"
 ))]
 pub mod book {
@@ -214,10 +216,10 @@ pub mod book {
     pub struct FirstScenePage;
     #[doc = include_str!("../../../docs/baking.md")]
     pub struct BakingPage;
-    #[doc = include_str!("../../../docs/contact.md")]
-    pub struct ContactPage;
     #[doc = include_str!("../../../docs/blender.md")]
     pub struct BlenderPage;
+    #[doc = include_str!("../../../docs/contact.md")]
+    pub struct ContactPage;
     #[doc = include_str!("../../../docs/multiuser.md")]
     pub struct MultiuserPage;
     #[doc = include_str!("../../../docs/devices.md")]

@@ -108,7 +108,7 @@ pub use probe::{ProbeState, TouchProbe, Touching};
 pub use ride_on::RideOn;
 pub use riding::RidingPlugin;
 pub use saved::SavedState;
-pub use step::PliantTick;
+pub use step::{PliantTick, RigidBodies};
 pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
 pub use surroundings::FixedObstacles;
 pub use visual::{Pose, VisualState};

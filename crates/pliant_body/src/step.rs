@@ -27,6 +27,11 @@ use crate::{
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct PliantTick(pub u64);
 
+/// The rigid bodies of another engine that give way to bodies in the next step, and afterwards what
+/// the contacts of the step did to them. Only a scene with such an engine has this resource.
+#[derive(Resource, Debug, Default)]
+pub struct RigidBodies(pub Vec<pliant_modal::Rigid>);
+
 /// Describes how the bodies' schedule runs.
 #[derive(Resource, Debug, Clone, Copy)]
 pub(crate) struct Stepping {
@@ -335,6 +340,7 @@ pub(crate) fn step_bodies(
     mut diagnostics: Diagnostics,
     mut refusals: Refusals,
     mut islands: Local<Islands>,
+    mut rigids: Option<ResMut<RigidBodies>>,
     mut bodies: Query<(NameOrEntity, &ModalBody, &Driven, &mut BodyState)>,
     mut probes: Query<(NameOrEntity, &TouchProbe, &mut ProbeState)>,
 ) {
@@ -382,7 +388,13 @@ pub(crate) fn step_bodies(
         scale == of_other && memberships & other[1] != 0 && other[0] & filters != 0
     };
     let may_probe = |probe: usize, body: usize| held[probe].1 == traits[body].1;
+    if let Some(rigids) = &mut rigids {
+        std::mem::swap(&mut islands.rigids, &mut rigids.0);
+    }
     islands.step_by(&mut together, &mut taken, step, may_touch, may_probe, on_all_threads);
+    if let Some(rigids) = &mut rigids {
+        std::mem::swap(&mut islands.rigids, &mut rigids.0);
+    }
     let results: Vec<_> = together.into_iter().map(|member| (member.resting, member.error)).collect();
     for ((entity, _), probe) in held.drain(..).zip(taken) {
         if let Ok((.., mut state)) = probes.get_mut(entity) {

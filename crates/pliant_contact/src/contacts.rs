@@ -108,7 +108,7 @@ pub struct ContactEnded {
 #[reflect(Component, Default)]
 pub(crate) struct Nearby {
     #[entities]
-    slots: Vec<Option<Entity>>,
+    pub(crate) slots: Vec<Option<Entity>>,
     /// BodyFriction that was refused, so that it is told once.
     refused: Option<f64>,
 }

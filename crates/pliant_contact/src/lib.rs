@@ -28,7 +28,9 @@
 //! | [`TouchBodies`] on bodies: they touch each other | |
 //! | [`ContactLayers`] on bodies and obstacles: who touches whom | [`BodyRefused`](pliant_body::BodyRefused): a refused obstacle |
 //!
-//! Obstacles push bodies, and bodies do not push obstacles. Bodies push each other. A body does not
+//! With the feature `avian` all colliders of avian3d 0.7 are obstacles too, and bodies push its
+//! dynamic rigid bodies, as they are pushed. An [`Obstacle`] pushes bodies, and bodies do not push
+//! it. Bodies push each other. A body does not
 //! touch itself. A body that another source moves
 //! ([`Driven::Remote`](pliant_body::Driven::Remote)) touches nothing here.
 //!
@@ -39,6 +41,8 @@
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
 )]
 
+#[cfg(feature = "avian")]
+mod avian;
 mod contacts;
 #[cfg(feature = "mesh")]
 mod mesh;
@@ -80,6 +84,8 @@ impl Plugin for ContactPlugin {
     fn build(&self, app: &mut App) {
         #[cfg(feature = "mesh")]
         app.init_resource::<mesh::Solids>();
+        #[cfg(feature = "avian")]
+        avian::build(app, self.schedule);
         app.register_type::<Obstacle>()
             .register_type::<ContactLayers>()
             .register_type::<BodyFriction>()

@@ -31,7 +31,7 @@ pub(crate) struct Solid {
 
 impl Solid {
     /// Distance (m) and normal at a point in the obstacle's axes.
-    fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
+    pub(crate) fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
         let p = Vector::new(point.x, point.y, point.z);
         let found = self.triangles.project_local_point_and_get_location_with_max_dist(p, false, f64::MAX);
         let Some((closest, (triangle, _))) = found.filter(|_| p.is_finite()) else {
@@ -50,7 +50,7 @@ impl Solid {
     }
 
     /// Makes the solid of a mesh with the scale of its entity.
-    fn new(source: &Source, scale: DVec3) -> Result<Self, StepError> {
+    pub(crate) fn new(source: &Source, scale: DVec3) -> Result<Self, StepError> {
         let points: Vec<DVec3> = source.positions.iter().map(|p| Vec3::from(*p).as_dvec3() * scale).collect();
         let bad = points.iter().find(|p| !p.is_finite());
         check("position in an obstacle's mesh", "finite numbers", bad.is_none(), f64::NAN)?;
@@ -176,10 +176,10 @@ impl modal::ObstacleShape for InWorldOf {
 }
 
 /// What a solid is made of.
-struct Source {
-    positions: Vec<[f32; 3]>,
-    triangles: Vec<[u32; 3]>,
-    hull: bool,
+pub(crate) struct Source {
+    pub(crate) positions: Vec<[f32; 3]>,
+    pub(crate) triangles: Vec<[u32; 3]>,
+    pub(crate) hull: bool,
 }
 
 impl Source {

@@ -89,6 +89,9 @@ enum Shape {
     Plain(Obstacle),
     #[cfg(feature = "mesh")]
     Solid(Arc<Solid>),
+    /// The shape of another engine's collider, m.
+    #[cfg(feature = "avian")]
+    Collider(Arc<dyn modal::ObstacleShape>),
 }
 
 #[cfg(feature = "mesh")]
@@ -104,6 +107,8 @@ impl PartialEq for Shape {
             (Self::Plain(a), Self::Plain(b)) => a == b,
             #[cfg(feature = "mesh")]
             (Self::Solid(a), Self::Solid(b)) => Arc::ptr_eq(a, b),
+            #[cfg(feature = "avian")]
+            (Self::Collider(a), Self::Collider(b)) => Arc::ptr_eq(a, b),
             #[cfg(feature = "mesh")]
             _ => false,
         }
@@ -120,6 +125,9 @@ pub(crate) struct Motion {
     rotation: DQuat,
     velocity: DVec3,
     spin: DVec3,
+    /// The body of another engine that gives way to soft bodies.
+    #[cfg(feature = "avian")]
+    pub(crate) rigid: Option<Entity>,
     /// Whether shape, pose or motion changed in this tick.
     pub(crate) changed: bool,
     /// Whether the shape's numbers are valid.
@@ -157,9 +165,32 @@ impl Motion {
             rotation: rotation.as_dquat().normalize(),
             velocity: DVec3::ZERO,
             spin: DVec3::ZERO,
+            #[cfg(feature = "avian")]
+            rigid: None,
             changed: true,
             sound: true,
         })
+    }
+
+    /// The motion of another engine's collider, at its pose at the end of the step.
+    #[cfg(feature = "avian")]
+    pub(crate) fn of_collider(
+        shape: Arc<dyn modal::ObstacleShape>,
+        pose: Pose,
+        [velocity, spin]: [DVec3; 2],
+        rigid: Option<Entity>,
+        awake: bool,
+        last: Option<&Self>,
+    ) -> Self {
+        let (position, rotation) = (pose.origin, pose.orientation);
+        let (shape, scale) = (Shape::Collider(shape), DVec3::ONE);
+        let now =
+            Self { shape, scale, position, rotation, velocity, spin, rigid, changed: true, sound: true };
+        // What moves is told anew at each step, so that the bodies near it stay awake with it.
+        let same =
+            |last: &Self| Self { changed: last.changed, sound: last.sound, ..now.clone() } == *last && !awake;
+        let changed = last.is_none_or(|last| !same(last));
+        Self { changed, sound: last.is_none_or(|last| last.sound), ..now }
     }
 
     /// Continues the motion of `last` over a step (s).
@@ -195,6 +226,17 @@ impl Motion {
             #[cfg(feature = "mesh")]
             Shape::Solid(solid) => {
                 return visit.visit(self.moving(InWorldOf { solid: solid.clone(), factor: scale }, scale));
+            }
+            #[cfg(feature = "avian")]
+            Shape::Collider(shape) => {
+                let shape = crate::avian::InWorldOf { shape: shape.clone(), factor: scale };
+                return match self.rigid {
+                    None => visit.visit(self.moving(shape, scale)),
+                    Some(rigid) => visit.visit(crate::avian::Owned {
+                        shape: self.moving(shape, scale),
+                        key: crate::avian::key(rigid, scale),
+                    }),
+                };
             }
         };
         match *plain {
@@ -311,7 +353,8 @@ pub(crate) fn move_obstacles(
     mut commands: Commands,
     transforms: TransformHelper,
     mut obstacles: Query<(Entity, &Obstacle, Option<&mut Motion>)>,
-    gone: Query<Entity, (With<Motion>, Without<Obstacle>)>,
+    #[cfg(not(feature = "avian"))] gone: Query<Entity, (With<Motion>, Without<Obstacle>)>,
+    #[cfg(feature = "avian")] gone: Query<Entity, crate::avian::Gone>,
 ) {
     for entity in &gone {
         commands.entity(entity).try_remove::<Motion>();
@@ -347,24 +390,34 @@ pub(crate) fn move_obstacles(
         if let (Some(now), Some(last)) = (&mut now, &motion) {
             *now = now.clone().after(last, step);
         }
-        if let Some(now) = now.as_mut().filter(|now| now.changed) {
-            let before = motion.as_ref().is_none_or(|last| last.sound);
-            let checked = now.obstacle(1.0).check();
-            now.sound = checked.is_ok();
-            if let (Err(error), true) = (checked, before) {
-                warn!("{entity}: {error}");
-                commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
-            }
+        keep(&mut commands, entity, motion, now);
+    }
+}
+
+/// Checks the motion of an obstacle and stores it.
+pub(crate) fn keep(
+    commands: &mut Commands,
+    entity: Entity,
+    motion: Option<Mut<Motion>>,
+    mut now: Option<Motion>,
+) {
+    if let Some(now) = now.as_mut().filter(|now| now.changed) {
+        let before = motion.as_ref().is_none_or(|last| last.sound);
+        let checked = now.obstacle(1.0).check();
+        now.sound = checked.is_ok();
+        if let (Err(error), true) = (checked, before) {
+            warn!("{entity}: {error}");
+            commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
         }
-        match (motion, now) {
-            (Some(mut motion), Some(now)) => *motion = now,
-            (Some(_), None) => {
-                commands.entity(entity).try_remove::<Motion>();
-            }
-            (None, Some(now)) => {
-                commands.entity(entity).try_insert(now);
-            }
-            (None, None) => {}
+    }
+    match (motion, now) {
+        (Some(mut motion), Some(now)) => *motion = now,
+        (Some(_), None) => {
+            commands.entity(entity).try_remove::<Motion>();
         }
+        (None, Some(now)) => {
+            commands.entity(entity).try_insert(now);
+        }
+        (None, None) => {}
     }
 }

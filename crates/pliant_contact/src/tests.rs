@@ -1,5 +1,7 @@
 //! A cube on obstacles in an app without a renderer, against what mechanics says.
 
+#[cfg(feature = "avian")]
+mod avian;
 #[cfg(feature = "mesh")]
 mod mesh;
 
@@ -38,6 +40,10 @@ struct Told {
 }
 
 fn app() -> App {
+    app_with(|_| ())
+}
+
+fn app_with(plugins: impl FnOnce(&mut App)) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
         .insert_resource(Time::<Fixed>::from_seconds(STEP))
@@ -49,6 +55,9 @@ fn app() -> App {
         .add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
             told.refused.push(refused.error.to_string());
         });
+    plugins(&mut app);
+    app.finish();
+    app.cleanup();
     app.update();
     app
 }

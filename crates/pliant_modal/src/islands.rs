@@ -3,9 +3,9 @@
 use nalgebra::Vector3;
 
 use crate::{
-    Body, Probe, StepError, StepReport,
+    Body, Probe, Rigid, StepError, StepReport,
     contact::{Sixes, Touched, Touching},
-    step::group::{self, Member, Parts, View},
+    step::group::{self, Member, Others, Parts, View},
 };
 
 /// A body that is stepped with others.
@@ -151,6 +151,11 @@ pub struct Islands {
     moves: Vec<bool>,
     /// The probes of the present island.
     held: Vec<usize>,
+    /// The rigid bodies of other engines that give way in the next steps. A step writes what the
+    /// contacts did to them. Those with a number that is not finite do not give way.
+    pub rigids: Vec<Rigid>,
+    /// The rigid bodies of the present island.
+    pushed: Vec<usize>,
 }
 
 impl Islands {
@@ -196,6 +201,7 @@ impl Islands {
         self.work.begin_step();
         self.find_pairs(bodies, &may_touch);
         self.find_probed(bodies, probes, h, &may_probe);
+        self.find_pushed(bodies, h);
         self.find_islands(bodies, probes);
         self.wake(bodies, probes);
         self.find_lone(bodies, probes);
@@ -219,9 +225,10 @@ impl Islands {
         }
         for index in 0..probes.len() {
             if probes[index].near.is_empty() {
-                let held = (&mut *probes, &[index][..], h);
+                let held = &[index][..];
+                let others = Others { probes: &mut *probes, held, rigids: &mut [], pushed: &[], h };
                 // The probe whose obstacle has failed is at its target.
-                let _ = group::step(bodies, &[], &[], &mut [], held, &mut self.work);
+                let _ = group::step(bodies, &[], &[], &mut [], others, &mut self.work);
             }
         }
         for together in bodies.iter_mut().filter(|together| !together.resting && !together.lone) {
@@ -255,9 +262,12 @@ impl Islands {
             }
         }
         let sixes = &mut self.sixes[..who.len()];
-        let Err(error) =
-            group::step(bodies, who, &self.members, sixes, (probes, &self.held, h), &mut self.work)
-        else {
+        let (root, bodies_count) = (self.first[who[0]], bodies.len());
+        self.pushed.clear();
+        self.pushed.extend((0..self.rigids.len()).filter(|&rigid| self.first[bodies_count + rigid] == root));
+        let (held, rigids, pushed) = (&self.held[..], &mut self.rigids[..], &self.pushed[..]);
+        let others = Others { probes, held, rigids, pushed, h };
+        let Err(error) = group::step(bodies, who, &self.members, sixes, others, &mut self.work) else {
             return;
         };
         for &index in who {
@@ -316,7 +326,35 @@ impl Islands {
         }
     }
 
-    /// Wakes the islands of which a member moves or is touched by a probe.
+    /// Finds the bodies near each rigid body that gives way.
+    fn find_pushed(&mut self, bodies: &[Together<'_>], h: f64) {
+        for rigid in &mut self.rigids {
+            rigid.forget();
+            rigid.near.clear();
+        }
+        if self.rigids.is_empty() {
+            return;
+        }
+        for (index, together) in bodies.iter().enumerate() {
+            let body = &*together.body;
+            let obstacles = body.contacts().obstacles().iter();
+            let mut ball = None;
+            for (obstacle, key) in obstacles.filter_map(|obstacle| Some((obstacle, obstacle.rigid()?))) {
+                let rigid = self.rigids.iter_mut().find(|rigid| rigid.key == key && rigid.is_sound());
+                let Some(rigid) = rigid.filter(|_| body.config().step == h) else { continue };
+                let ball = ball.get_or_insert_with(|| Ball::of(index, body));
+                if !ball.ends().iter().all(|x| x.is_finite()) {
+                    continue;
+                }
+                let way = h * (ball.velocity.norm() + obstacle.velocity(&ball.center).norm());
+                if obstacle.at(&ball.center).distance <= ball.radius + way && !rigid.near.contains(&index) {
+                    rigid.near.push(index);
+                }
+            }
+        }
+    }
+
+    /// Wakes the islands of which a member moves or is touched by a probe or a rigid body.
     fn wake(&mut self, bodies: &mut [Together<'_>], probes: &[Probe]) {
         // The entry of each island's first body says whether one moves.
         self.moves.clear();
@@ -324,7 +362,8 @@ impl Islands {
         for together in bodies.iter() {
             self.moves[together.island] |= !together.resting;
         }
-        for &near in probes.iter().flat_map(|probe| &probe.near) {
+        let rigids = self.rigids.iter().flat_map(|rigid| &rigid.near);
+        for &near in probes.iter().flat_map(|probe| &probe.near).chain(rigids) {
             self.moves[bodies[near].island] = true;
         }
         for together in bodies.iter_mut() {
@@ -340,15 +379,16 @@ impl Islands {
         for pair in &self.pairs {
             pair.iter().for_each(|&index| bodies[index as usize].lone = false);
         }
-        for &near in probes.iter().flat_map(|probe| &probe.near) {
+        let rigids = self.rigids.iter().flat_map(|rigid| &rigid.near);
+        for &near in probes.iter().flat_map(|probe| &probe.near).chain(rigids) {
             bodies[near].lone = false;
         }
     }
 
-    /// Joins the bodies of all pairs, and those near one probe.
+    /// Joins the bodies of all pairs, and those near one probe or near rigid bodies that touch.
     fn find_islands(&mut self, bodies: &mut [Together<'_>], probes: &[Probe]) {
         self.first.clear();
-        self.first.extend(0..bodies.len());
+        self.first.extend(0..bodies.len() + self.rigids.len());
         let root = |first: &[usize], mut index: usize| {
             while first[index] != index {
                 index = first[index];
@@ -356,13 +396,24 @@ impl Islands {
             index
         };
         let probed = probes.iter().flat_map(|probe| probe.near.windows(2).map(|pair| [pair[0], pair[1]]));
-        for pair in self.pairs.iter().map(|pair| pair.map(|index| index as usize)).chain(probed) {
+        // Rigid bodies come after all bodies.
+        let rigids = self.rigids.iter().enumerate().flat_map(|(number, rigid)| {
+            let own = bodies.len() + number;
+            let of = |key: [u64; 2]| self.rigids.iter().position(|other| other.key == key);
+            let touched = rigid.supports.iter().filter_map(move |support| of(support.other?));
+            let touched = touched.map(|other| bodies.len() + other);
+            rigid.near.iter().copied().chain(touched).map(move |other| [own, other])
+        });
+        let pairs = self.pairs.iter().map(|pair| pair.map(|index| index as usize));
+        for pair in pairs.chain(probed).chain(rigids) {
             let [a, b] = pair.map(|index| root(&self.first, index));
             self.first[a.max(b)] = a.min(b);
         }
-        for (index, body) in bodies.iter_mut().enumerate() {
+        for index in 0..self.first.len() {
             self.first[index] = root(&self.first, index);
-            body.island = self.first[index];
+        }
+        for (body, first) in bodies.iter_mut().zip(&self.first) {
+            body.island = *first;
         }
         self.order.clear();
         self.order.extend(0..bodies.len());

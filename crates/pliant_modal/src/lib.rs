@@ -64,8 +64,8 @@ pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, GrabId};
 pub use contact::{
     Capsule, Contact, ContactMemory, ContactReport, ContactState, Contacts, Cuboid, FixedObstacle,
-    FixedShape, Moving, ObstacleShape, Plane, Probe, ProbeConfig, ProbeContact, Sphere, SurfacePoint,
-    Touched, contact_force,
+    FixedShape, Moving, ObstacleShape, Plane, Probe, ProbeConfig, ProbeContact, Rigid, Sphere, Support,
+    SurfacePoint, Touched, contact_force,
 };
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};

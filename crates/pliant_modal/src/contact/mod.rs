@@ -26,6 +26,7 @@ mod fixed;
 mod obstacle;
 mod point;
 mod probe;
+mod rigid;
 mod shape;
 mod sites;
 mod solver;
@@ -36,9 +37,11 @@ pub use contacts::{Contact, ContactMemory, ContactReport, ContactState, Contacts
 pub use fixed::{FixedObstacle, FixedShape};
 pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint};
 pub use probe::{Probe, ProbeConfig, ProbeContact};
+pub use rigid::{Rigid, Support};
 
-pub(crate) use point::{AtProbe, ContactPoint, Far, Memory};
+pub(crate) use point::{AtProbe, AtRigid, AtSupport, ContactPoint, Far, Memory};
 pub(crate) use probe::{Grown, ProbeMemory};
+pub(crate) use rigid::Pushed;
 pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};
 pub(crate) use solver::{Clearance, Look, Touching};

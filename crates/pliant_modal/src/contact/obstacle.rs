@@ -44,6 +44,15 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
     fn fixed(&self) -> Option<FixedObstacle> {
         None
     }
+
+    /// Key of the [`Rigid`](crate::Rigid) to which the obstacle belongs, and which contacts push.
+    /// Default: `None`, for an obstacle that moves as it does whatever touches it.
+    ///
+    /// An obstacle of a rigid body is told at the pose that it has at the end of the step without
+    /// forces: the center of mass has gone by `h` times its velocity.
+    fn rigid(&self) -> Option<[u64; 2]> {
+        None
+    }
 }
 
 /// Returns the vector's length and its direction. A vector without direction returns `otherwise`.

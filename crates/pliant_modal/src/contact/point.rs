@@ -64,6 +64,30 @@ pub(crate) struct AtProbe {
     pub(crate) plane: [Vector3<f64>; 2],
 }
 
+/// The side of a contact at a rigid body, on which the force acts in the opposite direction.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AtRigid {
+    /// The rigid body, as an index into all, and its span.
+    pub(crate) rigid: usize,
+    pub(crate) span: usize,
+    /// Where the force acts, m, world axes: arms of both bodies lead to it.
+    pub(crate) middle: Vector3<f64>,
+    pub(crate) arm: Vector3<f64>,
+    /// Way of the surface in the step without forces, m, world axes.
+    pub(crate) carried: Vector3<f64>,
+    /// Where the surface sticks, at the beginning of the step, m, world axes.
+    pub(crate) anchor: Vector3<f64>,
+}
+
+/// The first side of a contact of a rigid body with another of its engine, or with what stands
+/// still. The member of the contact is the span of the rigid body.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AtSupport {
+    pub(crate) rigid: usize,
+    pub(crate) support: usize,
+    pub(crate) arm: Vector3<f64>,
+}
+
 /// A place that touches, or may touch, in this step.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ContactPoint {
@@ -76,6 +100,9 @@ pub(crate) struct ContactPoint {
     /// The side at a probe. The force is on the body, and at an obstacle on the probe, whose span
     /// then is the member. The anchor is relative to the center of the ball at a body.
     pub(crate) probe: Option<AtProbe>,
+    /// The side at a rigid body to which the obstacle belongs.
+    pub(crate) rigid: Option<AtRigid>,
+    pub(crate) support: Option<AtSupport>,
     pub(crate) friction: f64,
     /// Directions from the site's center to the contact point at the beginning and at the end of
     /// the step, body axes.
@@ -130,6 +157,8 @@ impl ContactPoint {
             other,
             far: None,
             probe: None,
+            rigid: None,
+            support: None,
             friction,
             first: zero,
             last: zero,

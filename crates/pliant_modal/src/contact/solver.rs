@@ -163,7 +163,8 @@ impl Touching {
                 Side { member, rows }
             };
             let probe = point.probe.map(|probe| probe.span).filter(|span| *span != point.member);
-            let other = point.far.map(|far| far.member).or(probe);
+            let rigid = point.rigid.map(|rigid| rigid.span);
+            let other = point.far.map(|far| far.member).or(probe).or(rigid);
             self.sides.push([Some(side(point.member)), other.map(side)]);
         }
         self.rows.clear();
@@ -181,7 +182,7 @@ impl Touching {
         self.sum.resize(self.width(), 0.0);
         let (mut count, mut local) = (0.0, 0.0);
         for (point, sides) in self.points.iter().zip(&self.sides) {
-            if point.off[0] < 0.0 || point.pushed[0] > 0.0 {
+            if point.support.is_none() && (point.off[0] < 0.0 || point.pushed[0] > 0.0) {
                 count += 1.0;
                 local += point.local[(0, 0)];
                 for side in sides.iter().flatten() {

@@ -481,7 +481,8 @@ impl Kernel {
         let step = self.h;
         let mut alone =
             [Alone(Parts { kernel: self, state, hands, load: *load, contacts, report: &mut report })];
-        let stepped = group::step(&mut alone, &[0], &[], &mut [], (&mut [], &[], step), &mut work);
+        let others = group::Others { probes: &mut [], held: &[], rigids: &mut [], pushed: &[], h: step };
+        let stepped = group::step(&mut alone, &[0], &[], &mut [], others, &mut work);
         contacts.touching = work;
         if let Err(StepError::Diverged { .. }) = stepped {
             contacts.forget();

@@ -12,15 +12,15 @@ use super::{
     touch::{RowsOfSide, take},
 };
 use crate::{
-    Probe, StepError,
+    Probe, Rigid, StepError,
     contact::{
         Contact, ContactPoint, ContactReport, ContactSites, Contacts, Memory, Shape, Sixes, Touched, Touching,
     },
     step::{Frame, Hand, Load, State, StepReport},
 };
 
-/// Largest number of times that a step is computed again with new forces, without hands and with
-/// them.
+/// Largest number of times that a step is computed again with new forces, without hands or rigid
+/// bodies and with them.
 const ROUNDS: [usize; 2] = [3, 6];
 
 /// Distance below which sites count as candidates, as a share of the body's size.
@@ -93,14 +93,28 @@ pub(super) struct Group<'a, P> {
     /// All probes, and the indices of those that touch the members.
     pub(super) probes: &'a mut [Probe],
     pub(super) held: &'a [usize],
+    /// All rigid bodies, and the indices of those that may touch the members.
+    pub(super) rigids: &'a mut [Rigid],
+    pub(super) pushed: &'a [usize],
     /// Size of the smallest member, m.
     pub(super) size: f64,
     pub(super) h: f64,
 }
 
+/// What is stepped with the members of a group.
+pub(crate) struct Others<'a> {
+    /// All probes, and the indices of those that touch the members. They have begun their step.
+    pub(crate) probes: &'a mut [Probe],
+    pub(crate) held: &'a [usize],
+    /// All rigid bodies, and the indices of those that may touch the members.
+    pub(crate) rigids: &'a mut [Rigid],
+    pub(crate) pushed: &'a [usize],
+    /// Length of the step, s.
+    pub(crate) h: f64,
+}
+
 /// Performs one step of the members `who`, which have the same step length. `pairs` has those that
-/// may touch each other, as indices into `who`. The probes `held` have begun their step of `h`
-/// seconds.
+/// may touch each other, as indices into `who`.
 ///
 /// # Errors
 /// Returns the error of an obstacle, or [`StepError::Diverged`] if the result of one member would
@@ -110,10 +124,11 @@ pub(crate) fn step<P: Member>(
     who: &[usize],
     pairs: &[[u32; 2]],
     sixes: &mut [[Sixes; 2]],
-    (probes, held, h): (&mut [Probe], &[usize], f64),
+    Others { probes, held, rigids, pushed, h }: Others<'_>,
     work: &mut Touching,
 ) -> Result<(), StepError> {
-    let mut group = Group { all, who, pairs, sixes, probes, held, size: f64::INFINITY, h };
+    let size = f64::INFINITY;
+    let mut group = Group { all, who, pairs, sixes, probes, held, rigids, pushed, size, h };
     for &probe in held {
         let probe = &mut group.probes[probe];
         probe.contacts.clear();
@@ -139,6 +154,7 @@ pub(crate) fn step<P: Member>(
             parts.contacts.report = ContactReport::default();
         }
         held.iter().for_each(|&probe| group.probes[probe].forget());
+        pushed.iter().for_each(|&rigid| group.rigids[rigid].forget());
         return Err(error);
     }
     Ok(())
@@ -274,6 +290,7 @@ impl<P: Member> Group<'_, P> {
                 point.arm = far.middle - self.view(point.member).kernel.pivot(theta);
                 far.arm = far.middle - self.view(far.member).kernel.pivot(theta);
             }
+            points::set_arms(self, point, theta);
         }
     }
 
@@ -325,6 +342,7 @@ impl<P: Member> Group<'_, P> {
             }
             self.probes[index].respond(&sum);
         }
+        points::respond(self, work, theta);
     }
 
     /// Computes the step until the laws of contact hold.
@@ -334,7 +352,8 @@ impl<P: Member> Group<'_, P> {
         theta: &mut Option<f64>,
         recovers: bool,
     ) -> Result<ContactReport, StepError> {
-        let holds = (0..self.len()).any(|member| !self.view(member).hands.is_empty());
+        let hands = (0..self.len()).any(|member| !self.view(member).hands.is_empty());
+        let holds = hands || !self.pushed.is_empty();
         let rounds = ROUNDS[usize::from(holds)];
         let mut report = ContactReport::default();
         loop {
@@ -349,11 +368,13 @@ impl<P: Member> Group<'_, P> {
             let band = if round == 1 { BAND * self.size } else { 0.0 };
             let (mut new, candidates) = points::detect(self, work, band)?;
             new |= points::detect_probes(self, work)?;
+            points::support(self, work);
             report.candidates += candidates;
             points::linearize(self, work, recovers)?;
             report.residual = work.violation();
             let enough = if round == 1 { STILL } else { ENOUGH } * self.size;
             if work.points.is_empty() || (report.residual <= enough && !new) || round > rounds {
+                points::take_supports(self, work);
                 return Ok(report);
             }
             self.set_arms(work, weight);
@@ -374,7 +395,8 @@ impl<P: Member> Group<'_, P> {
     /// Writes the rows of all points.
     fn fill_rows(&self, work: &mut Touching) {
         let bodies = (0..self.len()).map(|member| self.view(member).kernel.modes() + 6);
-        work.lay_out(bodies.chain(self.held.iter().map(|_| 3)));
+        let others = self.held.iter().map(|_| 3).chain(self.pushed.iter().map(|_| 6));
+        work.lay_out(bodies.chain(others));
         work.lay_out_rows();
         for member in 0..self.len() {
             let view = self.view(member);
@@ -417,6 +439,7 @@ impl<P: Member> Group<'_, P> {
                 row.iter_mut().zip(&point.axes.row(axis)).for_each(|(x, axis)| *x = root * axis);
             }
         }
+        points::fill_rows(self.rigids, work, self.h);
     }
 
     /// Weighs the rows of the frames, and takes from all rows what the hands hold back, so that the
@@ -435,6 +458,10 @@ impl<P: Member> Group<'_, P> {
                 }
             }
         }
+        let rigids = self.len() + self.held.len();
+        for side in work.sides.iter().flatten().flatten().filter(|side| side.member >= rigids) {
+            work.rows[side.rows..][..18].iter_mut().for_each(|x| *x *= scale);
+        }
     }
 
     /// Takes the energy that the step has gained from the velocities. Returns whether it had any.
@@ -451,7 +478,9 @@ impl<P: Member> Group<'_, P> {
         if work.points.iter().any(|point| point.probe.is_some() && point.pushed[0] > 0.0) {
             return false;
         }
-        let mut grounded = work.points.iter().any(|point| point.far.is_none() && point.pushed[0] > 0.0);
+        // A rigid body keeps what it has been given, whatever becomes of the members.
+        let fixed = |point: &ContactPoint| point.far.is_none() && point.rigid.is_none();
+        let mut grounded = work.points.iter().any(|point| fixed(point) && point.pushed[0] > 0.0);
         for member in 0..self.len() {
             let View { kernel, state, hands, load, contacts } = self.view(member);
             let other = Load { modal: load.modal, ..Load::default() } != load;
@@ -512,7 +541,8 @@ impl<P: Member> Group<'_, P> {
             for member in 0..self.len() {
                 self.parts(member).contacts.lost += (taken + allowed) / count;
             }
-            work.points.clear();
+            // What stopped the members stops a rigid body too, which would fall through them.
+            work.points.retain(|point| grounded && point.rigid.is_some());
             true
         } else if gained > 1e-12 * scale && moving > 0.0 {
             let left = (1.0 - gained / moving).max(0.0).sqrt();
@@ -593,6 +623,7 @@ impl<P: Member> Group<'_, P> {
         for &probe in self.held {
             self.probes[probe].memory.clear();
         }
+        points::tell(self, work);
         for point in &work.points {
             if let Some((probe, contact, memory)) = points::keep_at_probe(self, point) {
                 let probe = &mut self.probes[probe];
@@ -662,6 +693,10 @@ impl<P: Member> Group<'_, P> {
             let vertex = site.map_or(0, |site| site.vertex);
             (rest + turn * (anchor - far.end), vertex)
         });
+        if let Some(at) = point.rigid {
+            // What sticks to a rigid body stays in its axes.
+            anchor = self.rigids[at.rigid].to_local(&anchor, self.h);
+        }
         let (anchor, vertex) = far.unwrap_or((anchor, 0));
         let own = point.compliance - point.far.map_or_else(Matrix3::zeros, |far| far.compliance);
         let contacts = self.parts(point.member).contacts;

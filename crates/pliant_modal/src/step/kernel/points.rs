@@ -19,11 +19,13 @@ mod begin;
 mod detect;
 mod pass;
 mod probes;
+mod rigid;
 
 pub(super) use begin::begin;
 pub(super) use detect::detect;
 use pass::march;
 pub(super) use probes::{begin_probes, detect_probes, keep_at_probe};
+pub(super) use rigid::{fill_rows, respond, set_arms, support, take_supports, tell};
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
 const RECOVERED: f64 = 0.2;
@@ -143,6 +145,10 @@ pub(super) fn linearize<P: Member>(
             probes::linearize_at_probe(group, point, recovers)?;
             continue;
         }
+        if let Some(at) = point.support {
+            rigid::linearize_support(group, point, at);
+            continue;
+        }
         let view = group.view(point.member);
         let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { continue };
         let (kernel, state) = (view.kernel, view.state);
@@ -151,20 +157,27 @@ pub(super) fn linearize<P: Member>(
         let (located, distance) = match (point.other, &mut point.far) {
             (Touched::Obstacle(index), _) => {
                 let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
-                let located = kernel.locate(site, &**obstacle, &state.frame, &state.q)?;
+                let obstacle = rigid::pushed(group, &**obstacle);
+                let located = kernel.locate(site, &obstacle, &state.frame, &state.q)?;
                 let (mut distance, mut normal) = (located.found.distance, located.found.normal);
                 if point.passed {
                     // The site passed through: it is as far behind the place where it went in as it
                     // went on.
                     normal = point.axes.row(0).transpose();
                     let way = located.point - point.start;
-                    let begin = look(&**obstacle, &point.start)?;
-                    let through = march(&**obstacle, &point.start, &way, begin)?;
+                    let begin = look(&obstacle, &point.start)?;
+                    let through = march(&obstacle, &point.start, &way, begin)?;
                     distance = through.map_or(distance, |found| found.distance);
                 }
                 point.compliance = own;
                 point.turn(&normal);
-                if point.mean.is_none() {
+                if let Some(far) = &mut point.rigid {
+                    point.carried = far.carried + obstacle.way(&located.point);
+                    point.anchor = far.anchor + point.carried;
+                    if point.mean.is_none() {
+                        far.middle = 0.5 * (point.start + located.point);
+                    }
+                } else if point.mean.is_none() {
                     point.arm = located.point - Vector3::from(state.frame.center());
                 }
                 (located, distance)

@@ -6,7 +6,7 @@ use super::super::{
     group::{Group, Member, View},
     touch::look,
 };
-use super::{DEEP, carried, far_compliance, far_side, find, friction, locate_at_body};
+use super::{DEEP, carried, far_compliance, far_side, find, friction, locate_at_body, rigid};
 use crate::{
     StepError,
     contact::{ContactPoint, Guess, Memory, ObstacleShape, Shape, Site, Touched, Touching},
@@ -28,7 +28,7 @@ pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touchi
                 Touched::Probe(_) => {}
                 Touched::Obstacle(index) => {
                     let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
-                    work.points.push(begin_at_obstacle(member, &view, memory, site, &**obstacle)?);
+                    work.points.push(begin_at_obstacle(group, member, memory, site, &**obstacle)?);
                 }
                 Touched::Body(key) => {
                     let Some(other) = find(group, key) else { continue };
@@ -46,13 +46,14 @@ pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touchi
     Ok(())
 }
 
-fn begin_at_obstacle(
+fn begin_at_obstacle<P: Member>(
+    group: &Group<'_, P>,
     member: usize,
-    view: &View<'_>,
     memory: &Memory,
     site: &Site,
     obstacle: &dyn ObstacleShape,
 ) -> Result<ContactPoint, StepError> {
+    let view = group.view(member);
     let kernel = view.kernel;
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let located = kernel.locate(site, obstacle, frame, q)?;
@@ -63,8 +64,12 @@ fn begin_at_obstacle(
     point.compliance = kernel.site_compliance(site, frame, q);
     let gap = look(obstacle, &(located.point + point.carried))?.distance;
     point.arm = located.point - Vector3::from(frame.center());
-    let anchor = memory.anchor + point.carried;
+    // What sticks to a rigid body goes where that body goes.
+    let stuck = obstacle.rigid().and_then(|key| rigid::find(group, key));
+    let anchor = stuck.map_or(memory.anchor, |[at, _]| group.rigids[at].to_world(&memory.anchor));
+    let anchor = anchor + point.carried;
     resume(&mut point, memory, &located.found.normal, gap, anchor, kernel.model.size());
+    point.rigid = rigid::side(group, obstacle, &point, point.carried);
     Ok(point)
 }
 

@@ -7,10 +7,10 @@ use super::super::{
     touch::look,
 };
 use super::pass::{PARTS, march, pass};
-use super::{DEEP, carried, far_compliance, far_side, friction, locate_at_body, share};
+use super::{DEEP, carried, far_compliance, far_side, friction, locate_at_body, rigid, share};
 use crate::{
     StepError,
-    contact::{Clearance, ContactPoint, ContactSites, Guess, Look, Touched, Touching},
+    contact::{Clearance, ContactPoint, ContactSites, Guess, Look, ObstacleShape, Touched, Touching},
     step::Frame,
 };
 
@@ -57,6 +57,7 @@ pub(in super::super) fn detect<P: Member>(
         let travel = travel(&view, sites);
         for index in 0..view.contacts.obstacles().len() {
             detect_at_obstacle(
+                group,
                 (member, &view, sites, travel),
                 index,
                 work,
@@ -146,7 +147,8 @@ fn mark(work: &mut Touching, member: usize, other: Touched) -> u32 {
     work.stamp
 }
 
-fn detect_at_obstacle(
+fn detect_at_obstacle<P: Member>(
+    group: &Group<'_, P>,
     (member, view, sites, [travel, bound]): (usize, &View<'_>, &ContactSites, [f64; 2]),
     index: usize,
     work: &mut Touching,
@@ -156,6 +158,9 @@ fn detect_at_obstacle(
     let Some(obstacle) = view.contacts.obstacles().get(index).map(|obstacle| &**obstacle) else {
         return Ok(());
     };
+    // Where forces have moved it, and where it would be without them.
+    let (pushed, free) = (rigid::pushed(group, obstacle), obstacle);
+    let obstacle: &dyn ObstacleShape = &pushed;
     let kernel = view.kernel;
     let (before, state) = (&kernel.before, view.state);
     let (from, to) = (&before.frame, &state.frame);
@@ -207,10 +212,12 @@ fn detect_at_obstacle(
         let mut point = ContactPoint::new(member, number, other, view.contacts.friction());
         (point.first, point.last, point.start) = (located.toward, located.toward, start);
         point.tangent = tangent;
-        point.carried = carried(obstacle, &located.point, kernel.h)?;
-        point.gap = look(obstacle, &(start + point.carried))?.distance;
+        let by_itself = carried(free, &located.point, kernel.h)?;
+        point.gap = look(free, &(start + by_itself))?.distance;
+        point.carried = by_itself + pushed.way(&located.point);
         let way = located.point - start - point.carried;
         point.anchor = start + point.carried + share(point.gap, found.distance) * way;
+        point.rigid = rigid::side(group, free, &point, by_itself);
         if hit {
             // The plane at the place where the site went in.
             point.turn(&found.normal);

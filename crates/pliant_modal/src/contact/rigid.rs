@@ -1,0 +1,188 @@
+//! Rigid bodies of another engine, which give way to the bodies that touch them.
+
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+
+use super::{ObstacleShape, SurfacePoint};
+
+/// A rigid body of another engine in one step. Obstacles that belong to it name it by its key
+/// ([`ObstacleShape::rigid`]), and are pushed: within the step the body responds to the forces of
+/// the contacts, and the step tells their sum.
+///
+/// The other engine does the step of the rigid body. It must apply the force and the torque, and
+/// should let [`Rigid::weight`] of their way happen in the step, as of that of
+/// [`Rigid::acceleration`].
+#[derive(Debug, Clone, Default)]
+pub struct Rigid {
+    /// Name of the body, which no other of the step has.
+    pub key: [u64; 2],
+    /// Center of mass at the beginning of the step, m, world axes.
+    pub center: [f64; 3],
+    /// Rotation from body to world axes at the beginning of the step, x, y, z, w.
+    pub rotation: [f64; 4],
+    /// Velocity of the center of mass at the beginning of the step, m/s.
+    pub velocity: [f64; 3],
+    /// Angular velocity at the beginning of the step, rad/s, world axes.
+    pub angular_velocity: [f64; 3],
+    /// Acceleration by everything but contacts, as gravity, m/s^2.
+    pub acceleration: [f64; 3],
+    /// Inverse mass along the world axes, 1/kg. Zero where the body is locked.
+    pub inverse_mass: [f64; 3],
+    /// Inverse inertia about the center of mass, 1/(kg m^2), world axes.
+    pub inverse_inertia: [[f64; 3]; 3],
+    /// Where the body touches others of its engine.
+    pub supports: Vec<Support>,
+    /// Set by a step: mean force of the contacts, N.
+    pub force: [f64; 3],
+    /// Set by a step: mean torque of the contacts about the center of mass, N m, world axes.
+    pub torque: [f64; 3],
+    /// Set by a step: the way of the body by the force and the acceleration, as a share of `h^2`
+    /// times the acceleration that they give, 0.5 to 1.
+    pub weight: f64,
+    /// Set by a step: whether a support holds the body against the contacts.
+    pub is_held: bool,
+    /// Set by a step: way and turn by the force and the acceleration, m and rad, world axes.
+    pub way: Vector3<f64>,
+    /// As [`Rigid::way`].
+    pub turn: Vector3<f64>,
+    /// Set by a step: the bodies that may touch it, by their indices.
+    pub near: Vec<usize>,
+}
+
+/// A place where a [`Rigid`] touches a body of its own engine. A step takes from it what the body
+/// can give way. The force is that engine's work; what the step expects may begin its solver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Support {
+    /// The other body, if it is one of the step and gives way too.
+    pub other: Option<[u64; 2]>,
+    /// Place at the beginning of the step, m.
+    pub point: [f64; 3],
+    /// Unit normal, from the other to this body.
+    pub normal: [f64; 3],
+    /// Gap at the beginning of the step, m.
+    pub gap: f64,
+    /// Coefficient of friction.
+    pub friction: f64,
+    /// Velocity of the other's material there, m/s. It counts only if the other does not give way.
+    pub velocity: [f64; 3],
+    /// Set by a step: force along the normal, N.
+    pub force: f64,
+}
+
+impl Rigid {
+    /// Whether all numbers are finite.
+    pub(crate) fn is_sound(&self) -> bool {
+        let vectors = [self.center, self.velocity, self.angular_velocity, self.acceleration];
+        let masses = self.inverse_mass.iter().chain(self.inverse_inertia.iter().flatten());
+        vectors.iter().flatten().chain(&self.rotation).all(|x| x.is_finite())
+            && masses.clone().all(|x| x.is_finite())
+            && self.inverse_mass.iter().all(|x| *x >= 0.0)
+    }
+
+    fn inertia(&self) -> Matrix3<f64> {
+        Matrix3::from_fn(|i, j| self.inverse_inertia[i][j])
+    }
+
+    /// Center of mass at the end of the step without forces, m.
+    fn free_center(&self, h: f64) -> Vector3<f64> {
+        Vector3::from(self.center) + h * Vector3::from(self.velocity)
+    }
+
+    /// The center about which a force turns the body in this step: the angular momentum that it
+    /// adds is `h (point - center) x force` about any point.
+    pub(crate) fn pivot(&self, weight: f64, h: f64) -> Vector3<f64> {
+        Vector3::from(self.center) + (1.0 - weight) * h * Vector3::from(self.velocity)
+    }
+
+    /// Takes the way of the step under a force (N) and a torque (N m).
+    pub(crate) fn respond(&mut self, force: &Vector3<f64>, torque: &Vector3<f64>, weight: f64, h: f64) {
+        let acceleration =
+            Vector3::from(self.acceleration) + Vector3::from(self.inverse_mass).component_mul(force);
+        self.weight = weight;
+        self.way = weight * h * h * acceleration;
+        self.turn = weight * h * h * (self.inertia() * torque);
+    }
+
+    /// Displacement of the material at a point (m) at the beginning of the step, m.
+    pub(crate) fn displacement(&self, point: &Vector3<f64>, h: f64) -> Vector3<f64> {
+        let arm = point - Vector3::from(self.center);
+        let spin = h * Vector3::from(self.angular_velocity) + self.turn;
+        h * Vector3::from(self.velocity) + self.way + spin.cross(&arm)
+    }
+
+    /// Where the material that is at `point` (m) at the end of the step would be without forces.
+    pub(crate) fn pull_back(&self, point: &Vector3<f64>, h: f64) -> Vector3<f64> {
+        let center = self.free_center(h);
+        center + UnitQuaternion::from_scaled_axis(-self.turn) * (point - center - self.way)
+    }
+
+    fn turned(&self) -> UnitQuaternion<f64> {
+        let [x, y, z, w] = self.rotation;
+        UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9).unwrap_or_default()
+    }
+
+    /// A point of the body's axes (m) at the beginning of the step, world axes.
+    pub(crate) fn to_world(&self, local: &Vector3<f64>) -> Vector3<f64> {
+        Vector3::from(self.center) + self.turned() * local
+    }
+
+    /// A point at the end of the step (m) in the body's axes.
+    pub(crate) fn to_local(&self, point: &Vector3<f64>, h: f64) -> Vector3<f64> {
+        let free = UnitQuaternion::from_scaled_axis(h * Vector3::from(self.angular_velocity));
+        (free * self.turned()).inverse() * (self.pull_back(point, h) - self.free_center(h))
+    }
+
+    /// Writes three rows of six: the response to a unit force along an axis at `arm` is a row times
+    /// another, for a weight of 1.
+    pub(crate) fn fill_rows(&self, axes: &Matrix3<f64>, arm: &Vector3<f64>, h: f64, rows: &mut [f64]) {
+        // Where an axis is locked the inverse has no Cholesky factor.
+        let own = self.inertia().symmetric_eigen();
+        let mut root = own.eigenvectors;
+        for (mut column, value) in root.column_iter_mut().zip(&own.eigenvalues) {
+            column *= value.max(0.0).sqrt();
+        }
+        for (axis, row) in rows.chunks_exact_mut(6).enumerate() {
+            let direction = axes.row(axis).transpose();
+            let spin = root.tr_mul(&arm.cross(&direction));
+            for k in 0..3 {
+                row[k] = h * self.inverse_mass[k].max(0.0).sqrt() * direction[k];
+                row[3 + k] = h * spin[k];
+            }
+        }
+    }
+
+    /// Largest inverse mass, 1/kg.
+    pub(crate) fn lightness(&self) -> f64 {
+        self.inverse_mass.iter().copied().fold(0.0, f64::max)
+    }
+
+    /// Forgets what the last step has set.
+    pub(crate) fn forget(&mut self) {
+        (self.force, self.torque, self.weight) = ([0.0; 3], [0.0; 3], 1.0);
+        self.is_held = false;
+        self.supports.iter_mut().for_each(|support| support.force = 0.0);
+        (self.way, self.turn) = (Vector3::zeros(), Vector3::zeros());
+    }
+}
+
+/// An obstacle where forces of the step have moved it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Pushed<'a> {
+    pub(crate) shape: &'a dyn ObstacleShape,
+    pub(crate) by: Option<&'a Rigid>,
+    pub(crate) h: f64,
+}
+
+impl ObstacleShape for Pushed<'_> {
+    fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
+        let Some(rigid) = self.by else { return self.shape.at(point) };
+        let found = self.shape.at(&rigid.pull_back(point, self.h));
+        SurfacePoint { normal: UnitQuaternion::from_scaled_axis(rigid.turn) * found.normal, ..found }
+    }
+}
+
+impl Pushed<'_> {
+    /// Way of the surface at a point by forces of the step, m.
+    pub(crate) fn way(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.by.map_or_else(Vector3::zeros, |rigid| point - rigid.pull_back(point, self.h))
+    }
+}
