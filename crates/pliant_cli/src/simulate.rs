@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use clap::Args;
-use pliant_lab::simulate::{SimulateReport, SimulateSettings, simulate};
+use pliant_lab::simulate::{FaultKind, SimulateReport, SimulateSettings, simulate};
 
 use crate::{CliError, output, progress::Bar};
 
@@ -21,7 +21,12 @@ pub(crate) struct SimulateArgs {
 }
 
 pub(crate) fn run(args: &SimulateArgs) -> Result<(), CliError> {
-    let settings = SimulateSettings { from: args.from, seeds: args.seeds, memory: None };
+    let settings = SimulateSettings {
+        from: args.from,
+        seeds: args.seeds,
+        kinds: &FaultKind::ALL,
+        memory: None,
+    };
     let report = simulate(&settings, &mut Bar::new()).map_err(CliError::from)?;
     if args.json {
         output::print_json(&report)?
@@ -47,13 +52,16 @@ fn text(report: &SimulateReport) -> String {
     let _ = write!(
         text,
         "{} sessions of {:.0} s, {} ticks; faults that took effect: {}, of {} drawn; largest reaction told over the largest true one \
-         {:.3}; {} broke; {:.0} s",
+         {:.3}; {:.1} N of a device at most, which rise by {:.3} of the slew limit at most, in {} periods; {} broke; {:.0} s",
         report.seeds,
         report.virtual_seconds / report.seeds.max(1) as f64,
         report.ticks,
         faults.join(", "),
         report.drawn,
         report.largest_share,
+        report.largest_force,
+        report.largest_rise,
+        report.device_periods,
         report.failures.len(),
         report.seconds
     );

@@ -4,6 +4,7 @@
 //! Nothing sleeps. Time jumps to the next event: a step of the host, an arrival or a guest's next
 //! tick. A [`World`] is the caller's side: what a game does around a session.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
@@ -52,6 +53,128 @@ impl PathConfig {
     }
 }
 
+/// Datagrams that wait for a thread that stands still, as in a transport's queues. Of more, the
+/// oldest are dropped.
+pub(crate) const WAITING: usize = 64;
+
+/// Which threads of a process stand still.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Stalled {
+    /// The thread of the app's frames: nothing is handled or stepped, and what arrives waits.
+    pub app: bool,
+    /// The thread of the network: nothing is received or sent, and what the app sends waits.
+    pub network: bool,
+}
+
+impl From<bool> for Stalled {
+    /// All threads, or none.
+    fn from(all: bool) -> Self {
+        Self { app: all, network: all }
+    }
+}
+
+/// What waits between two threads of a process.
+#[derive(Debug)]
+pub(crate) struct Waiting<T> {
+    messages: VecDeque<T>,
+    datagrams: VecDeque<T>,
+}
+
+impl<T> Default for Waiting<T> {
+    fn default() -> Self {
+        Self { messages: VecDeque::new(), datagrams: VecDeque::new() }
+    }
+}
+
+impl<T> Waiting<T> {
+    /// Of more than `most` datagrams, the oldest is dropped.
+    pub(crate) fn push(&mut self, channel: Channel, packet: T, most: usize) {
+        if channel == Channel::Message {
+            return self.messages.push_back(packet);
+        }
+        if self.datagrams.len() >= most {
+            self.datagrams.pop_front();
+        }
+        self.datagrams.push_back(packet);
+    }
+
+    /// Takes the oldest message, or the oldest datagram where there is no message.
+    pub(crate) fn pop(&mut self) -> Option<(Channel, T)> {
+        let message = self.messages.pop_front().map(|packet| (Channel::Message, packet));
+        message.or_else(|| Some((Channel::Datagram, self.datagrams.pop_front()?)))
+    }
+}
+
+/// One direction between the host and a guest.
+#[derive(Debug)]
+struct Way {
+    reliable: EmulatedLink,
+    /// Sent by an app whose network stands still.
+    sent: Waiting<Vec<u8>>,
+    /// Received for an app that stands still.
+    received: Waiting<Vec<u8>>,
+}
+
+impl Way {
+    fn new(link: &LinkConfig, seed: u64) -> Self {
+        let reliable = EmulatedLink::new(reliable(link), seed);
+        Self { reliable, sent: Waiting::default(), received: Waiting::default() }
+    }
+
+    fn send(
+        &mut self,
+        datagrams: &mut EmulatedLink,
+        from: Stalled,
+        now: Duration,
+        (channel, bytes): (Channel, Vec<u8>),
+    ) {
+        if from.network {
+            return self.sent.push(channel, bytes, WAITING);
+        }
+        let link = if channel == Channel::Datagram { datagrams } else { &mut self.reliable };
+        let size = bytes.len();
+        link.send(now, bytes, size);
+    }
+
+    /// What the network's threads do: sends what has waited, and receives for the app `to`.
+    fn pass(&mut self, datagrams: &mut EmulatedLink, [from, to]: [Stalled; 2], parted: bool, now: Duration) {
+        while let Some(packet) = (!from.network).then(|| self.sent.pop()).flatten() {
+            self.send(datagrams, from, now, packet);
+        }
+        if to.network {
+            return;
+        }
+        // An app that runs reads at once.
+        let most = if to.app { WAITING } else { usize::MAX };
+        while let Some(bytes) = (!parted).then(|| self.reliable.poll(now)).flatten() {
+            self.received.push(Channel::Message, bytes, most);
+        }
+        while let Some(bytes) = datagrams.poll(now) {
+            if !parted {
+                self.received.push(Channel::Datagram, bytes, most);
+            }
+        }
+    }
+}
+
+/// The link for messages beside one for datagrams.
+fn reliable(link: &LinkConfig) -> LinkConfig {
+    LinkConfig {
+        jitter: link.jitter
+            + match link.loss {
+                Loss::Random(p) => link.delay.mul_f64(3.0 * p.clamp(0.0, 0.9)),
+                _ => Duration::ZERO,
+            },
+        keep_order: true,
+        loss: Loss::None,
+        reorder: 0.0,
+        duplicate: 0.0,
+        queue_bytes: usize::MAX,
+        trace: None,
+        ..link.clone()
+    }
+}
+
 /// One guest and its links.
 #[derive(Debug)]
 pub struct GuestEnd {
@@ -61,26 +184,17 @@ pub struct GuestEnd {
     pub down: EmulatedLink,
     /// Link for datagrams, guest to host.
     pub up: EmulatedLink,
-    reliable_down: EmulatedLink,
-    reliable_up: EmulatedLink,
+    to_guest: Way,
+    to_host: Way,
     connected: bool,
-    stalled: bool,
+    /// What this guest has sent before it was cut off still arrives.
+    lingers: bool,
+    stalled: Stalled,
     parted: bool,
     /// The host that this guest was connected to is gone.
     lost: bool,
     /// The guest's clock minus the virtual time.
     ahead: Duration,
-}
-
-impl GuestEnd {
-    fn send(&mut self, now: Duration, channel: Channel, bytes: Vec<u8>) {
-        let link = match channel {
-            Channel::Datagram => &mut self.up,
-            Channel::Message => &mut self.reliable_up,
-        };
-        let size = bytes.len();
-        link.send(now, bytes, size);
-    }
 }
 
 /// A host and its guests in virtual time.
@@ -96,7 +210,7 @@ pub struct Pair {
     next_step: Duration,
     tick: u64,
     paused: bool,
-    stalled: bool,
+    stalled: Stalled,
     /// The host's clock minus the virtual time.
     ahead: Duration,
     clock: Option<fn() -> Duration>,
@@ -119,7 +233,7 @@ impl Pair {
             next_step: step,
             tick: 0,
             paused: false,
-            stalled: false,
+            stalled: Stalled::default(),
             ahead: Duration::ZERO,
             clock: None,
             spent: Duration::ZERO,
@@ -154,18 +268,17 @@ impl Pair {
         self.next_step = self.next_step.max(self.now);
     }
 
-    /// Stalls or continues the host's process: nothing is read, stepped or sent. What arrives
-    /// waits. Afterwards the host catches up on a quarter of a second at most, like an app with
-    /// Bevy's clock.
-    pub fn stall_host(&mut self, stalled: bool) {
-        self.stalled = stalled;
+    /// Stalls or continues the host's process, or one thread of it. Afterwards the host catches up
+    /// on a quarter of a second at most, like an app with Bevy's clock.
+    pub fn stall_host(&mut self, stalled: impl Into<Stalled>) {
+        self.stalled = stalled.into();
         self.next_step = self.next_step.max(self.now.saturating_sub(Duration::from_millis(250)));
     }
 
     /// Stalls or continues a guest's process, as [`Pair::stall_host`] does for the host.
-    pub fn stall_guest(&mut self, guest: usize, stalled: bool) {
+    pub fn stall_guest(&mut self, guest: usize, stalled: impl Into<Stalled>) {
         if let Some(g) = self.guests.get_mut(guest) {
-            g.stalled = stalled;
+            g.stalled = stalled.into();
         }
     }
 
@@ -190,7 +303,7 @@ impl Pair {
     pub fn send_as(&mut self, guest: usize, channel: Channel, bytes: Vec<u8>) {
         let now = self.now;
         if let Some(g) = self.guests.get_mut(guest).filter(|g| g.connected) {
-            g.send(now, channel, bytes);
+            g.to_host.send(&mut g.up, g.stalled, now, (channel, bytes));
         }
     }
 
@@ -238,28 +351,15 @@ impl Pair {
         prepare(&mut session);
         self.host.connect(self.now + self.ahead, peer, path.max_datagram)?;
         session.connect(self.now)?;
-        let reliable = |link: &LinkConfig| LinkConfig {
-            jitter: link.jitter
-                + match link.loss {
-                    Loss::Random(p) => link.delay.mul_f64(3.0 * p.clamp(0.0, 0.9)),
-                    _ => Duration::ZERO,
-                },
-            keep_order: true,
-            loss: Loss::None,
-            reorder: 0.0,
-            duplicate: 0.0,
-            queue_bytes: usize::MAX,
-            trace: None,
-            ..link.clone()
-        };
         self.guests.push(GuestEnd {
             session,
-            reliable_down: EmulatedLink::new(reliable(&path.down), seed ^ 0x5157),
-            reliable_up: EmulatedLink::new(reliable(&path.up), seed ^ 0x7515),
+            to_guest: Way::new(&path.down, seed ^ 0x5157),
+            to_host: Way::new(&path.up, seed ^ 0x7515),
             down: EmulatedLink::new(path.down, seed),
             up: EmulatedLink::new(path.up, seed ^ 0xFFFF_0000),
             connected: true,
-            stalled: false,
+            lingers: false,
+            stalled: Stalled::default(),
             parted: false,
             lost: false,
             ahead: Duration::ZERO,
@@ -270,8 +370,15 @@ impl Pair {
     /// Cuts off a guest without notice, as when a process is killed. Nothing passes after that.
     pub fn cut(&mut self, guest: usize) {
         if let Some(g) = self.guests.get_mut(guest) {
-            g.connected = false;
+            (g.connected, g.lingers) = (false, false);
         }
+    }
+
+    /// Gives up a guest's attempt to join. What it has sent still arrives, and what is sent to it
+    /// does not.
+    pub fn abandon(&mut self, guest: usize) {
+        self.cut(guest);
+        self.guests.get_mut(guest).into_iter().for_each(|g| g.lingers = true);
     }
 
     /// Runs until the time `until`.
@@ -280,7 +387,7 @@ impl Pair {
             self.exchange(world);
             let Some(next) = self.next_time().filter(|t| *t <= until) else { break };
             self.now = self.now.max(next);
-            if !self.paused && !self.stalled && self.now >= self.next_step {
+            if !self.paused && !self.stalled.app && self.now >= self.next_step {
                 self.tick += 1;
                 self.next_step += self.step;
                 world.step(self.now + self.ahead, self.tick, &mut self.host);
@@ -290,7 +397,7 @@ impl Pair {
     }
 
     fn next_time(&self) -> Option<Duration> {
-        let steps = !self.paused && !self.stalled;
+        let steps = !self.paused && !self.stalled.app;
         let mut next = steps.then(|| self.next_step.max(self.now));
         let mut take = |t: Option<Duration>| {
             next = match (next, t) {
@@ -299,18 +406,18 @@ impl Pair {
             };
         };
         let host = self.host.next_wakeup().map(|t| t.saturating_sub(self.ahead));
-        take(host.filter(|_| !self.stalled));
+        take(host.filter(|_| !self.stalled.app));
         for g in self.guests.iter().filter(|g| g.connected) {
-            // What arrives at a process that stalls waits, and messages wait for the network.
+            // What arrives at a network that stalls waits, and messages wait for the network.
             for (link, stalled) in [
-                (&g.down, g.stalled),
-                (&g.reliable_down, g.stalled || g.parted),
-                (&g.up, self.stalled),
-                (&g.reliable_up, self.stalled || g.parted),
+                (&g.down, g.stalled.network),
+                (&g.to_guest.reliable, g.stalled.network || g.parted),
+                (&g.up, self.stalled.network),
+                (&g.to_host.reliable, self.stalled.network || g.parted),
             ] {
                 take(link.next_wakeup().filter(|_| !stalled));
             }
-            if g.stalled {
+            if g.stalled.app {
                 continue;
             }
             // Serving a wake-up does not change its time, so the next one must lie later to avoid
@@ -327,45 +434,40 @@ impl Pair {
         let host_now = now + self.ahead;
         for (index, g) in self.guests.iter_mut().enumerate() {
             let peer = PeerId(index as u64 + 1);
-            if !self.stalled {
-                // Poll the reliable link first, so that a snapshot is handled before a frame of the
-                // same arrival time.
-                while let Some(bytes) = (!g.parted).then(|| g.reliable_up.poll(now)).flatten() {
-                    if g.connected && !g.lost {
-                        self.host.on_message(host_now, peer, &bytes);
-                    }
-                }
-                while let Some(bytes) = g.up.poll(now) {
-                    if g.connected && !g.lost && !g.parted {
-                        self.host.on_datagram(host_now, peer, &bytes);
-                    }
+            g.to_host.pass(&mut g.up, [g.stalled, self.stalled], g.parted, now);
+            g.to_guest.pass(&mut g.down, [self.stalled, g.stalled], g.parted, now);
+            // Messages come first, so that a snapshot is handled before a frame of the same arrival
+            // time.
+            while let Some((channel, bytes)) = (!self.stalled.app).then(|| g.to_host.received.pop()).flatten()
+            {
+                match channel {
+                    _ if !(g.connected || g.lingers) || g.lost => {}
+                    Channel::Message => self.host.on_message(host_now, peer, &bytes),
+                    Channel::Datagram => self.host.on_datagram(host_now, peer, &bytes),
                 }
             }
-            if g.stalled {
+            if g.stalled.app {
                 continue;
             }
             let began = self.clock.map(|c| c());
-            while let Some(bytes) = (!g.parted).then(|| g.reliable_down.poll(now)).flatten() {
-                if g.connected {
-                    g.session.on_message(now + g.ahead, &bytes);
-                }
-            }
-            while let Some(bytes) = g.down.poll(now) {
-                if g.connected && !g.parted {
-                    g.session.on_datagram(now + g.ahead, &bytes);
+            while let Some((channel, bytes)) = g.to_guest.received.pop() {
+                match channel {
+                    _ if !g.connected => {}
+                    Channel::Message => g.session.on_message(now + g.ahead, &bytes),
+                    Channel::Datagram => g.session.on_datagram(now + g.ahead, &bytes),
                 }
             }
             if let (Some(clock), Some(began)) = (self.clock, began) {
                 self.spent += clock().saturating_sub(began);
             }
         }
-        if !self.stalled {
+        if !self.stalled.app {
             self.host.update(host_now);
             while let Some(event) = self.host.poll_event() {
                 world.host_event(host_now, event, &mut self.host);
             }
         }
-        for (index, g) in self.guests.iter_mut().enumerate().filter(|(_, g)| g.connected && !g.stalled) {
+        for (index, g) in self.guests.iter_mut().enumerate().filter(|(_, g)| g.connected && !g.stalled.app) {
             let own = now + g.ahead;
             let began = self.clock.map(|c| c());
             let stepped = g.session.update(own);
@@ -380,17 +482,13 @@ impl Pair {
             g.session.update(own);
             while let Some(Output { channel, bytes, .. }) = g.session.poll_output() {
                 world.guest_sent(index, channel, &bytes);
-                g.send(now, channel, bytes.to_vec());
+                g.to_host.send(&mut g.up, g.stalled, now, (channel, bytes.to_vec()));
             }
         }
         while let Some(Output { peer, channel, bytes }) = self.host.poll_output() {
             let index = usize::try_from(peer.0.wrapping_sub(1)).unwrap_or(usize::MAX);
             let Some(g) = self.guests.get_mut(index) else { continue };
-            let link = match channel {
-                Channel::Datagram => &mut g.down,
-                Channel::Message => &mut g.reliable_down,
-            };
-            link.send(now, bytes.to_vec(), bytes.len());
+            g.to_guest.send(&mut g.down, self.stalled, now, (channel, bytes.to_vec()));
         }
     }
 }

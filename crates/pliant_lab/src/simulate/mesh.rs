@@ -7,8 +7,9 @@ use std::time::Duration;
 use pliant_modal::ModalModel;
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig};
-use pliant_stream::{BodyId, Channel, DisconnectReason, Output, PeerId, StepSettings, UserId};
+use pliant_stream::{BodyId, Channel, DisconnectReason, GrabKey, Output, PeerId, StepSettings, UserId};
 
+use super::device::{DeviceLoop, Felt};
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::{Processes, disturbed, network};
@@ -16,6 +17,7 @@ use super::{
     AGREES, Digest, END, FaultKind, HEALED, IDLE, LOOK, MAX_FORCE, MAX_MEMORY, Memory, Outcome,
     SimulatedFault, apart, hand, hold, norm,
 };
+use crate::pair::{Stalled, WAITING, Waiting};
 
 const BODY: BodyId = BodyId(1);
 /// Ticks that may lie between two peers, or between a peer and its newest final tick, at the end.
@@ -41,6 +43,9 @@ struct Side {
     /// The session of this side knows the connection.
     open: bool,
     closed: bool,
+    /// Sent while the network of this side stands still, and received while its app does.
+    sent: Waiting<Packet>,
+    received: Waiting<Packet>,
 }
 
 /// A connection. Its number is its [`PeerId`] on both sides.
@@ -55,6 +60,7 @@ struct Node {
     life: u32,
     ahead: Duration,
     grab: Option<u16>,
+    device: Option<DeviceLoop>,
     /// Whom it looks for, and when it tries next.
     missed: BTreeMap<usize, Duration>,
     /// When it tries to join, as long as it has no number.
@@ -74,6 +80,7 @@ struct Mesh {
     random: Random,
     now: Duration,
     ticks: u64,
+    felt: Felt,
     digest: Digest,
     broken: Option<String>,
 }
@@ -106,6 +113,7 @@ pub(super) fn run(
         random: Random::new(!seed ^ random.next()),
         now: Duration::ZERO,
         ticks: 0,
+        felt: Felt::default(),
         digest: Digest::EMPTY,
         broken: None,
     };
@@ -116,6 +124,7 @@ pub(super) fn run(
             life: 0,
             ahead: Duration::ZERO,
             grab: None,
+            device: None,
             missed: BTreeMap::new(),
             join: None,
             finals: VecDeque::new(),
@@ -159,6 +168,7 @@ pub(super) fn run(
     Ok(Outcome {
         ticks: mesh.ticks,
         share: 0.0,
+        felt: mesh.felt,
         took: mesh.processes.took(),
         digest: mesh.digest,
         memory: [memory.largest, held],
@@ -199,13 +209,20 @@ impl Mesh {
         }
         match fault.kind {
             FaultKind::ClockJump => self.nodes[fault.process].ahead += fault.lasts,
-            FaultKind::Crash => self.nodes[fault.process].session = None,
-            FaultKind::SecondConnection => {
-                // It calls somebody who does not know yet that the old connection is of no use.
+            FaultKind::Crash => {
+                let node = &mut self.nodes[fault.process];
+                (node.session, node.device) = (None, None);
+            }
+            FaultKind::SecondConnection | FaultKind::LateReconnect => {
+                // It calls somebody who does not know yet that the old connection is of no use. A
+                // late call arrives after the one that follows.
                 let other = others.clone().nth(self.random.index(others.count().max(1))).unwrap_or(0);
                 let known = self.nodes[fault.process].session.as_ref().is_some_and(|s| s.tick() > 0);
                 if known && other != fault.process {
                     self.processes.take_last();
+                    if fault.kind == FaultKind::LateReconnect {
+                        self.dial_over(fault.lasts, fault.process, other, Some(number(other)));
+                    }
                     self.dial(fault.process, other, Some(number(other)));
                 }
             }
@@ -215,21 +232,29 @@ impl Mesh {
 
     /// Connects a process to another. The other one learns of it from the first message.
     fn dial(&mut self, from: usize, to: usize, user: Option<UserId>) {
+        self.dial_over(Duration::ZERO, from, to, user);
+    }
+
+    /// The same over a path that is slower by so much.
+    fn dial_over(&mut self, slower: Duration, from: usize, to: usize, user: Option<UserId>) {
         let peer = PeerId(self.wires.len() as u64);
         let own = self.now + self.nodes[from].ahead;
         let Some(session) = &mut self.nodes[from].session else { return };
         let connected = session.connect(own, peer, user, 1200);
         let lives = [self.nodes[from].life, self.nodes[to].life];
-        let reliable = LinkConfig { loss: Loss::None, keep_order: true, ..self.path.clone() };
+        let path = LinkConfig { delay: self.path.delay + slower, ..self.path.clone() };
+        let reliable = LinkConfig { loss: Loss::None, keep_order: true, ..path.clone() };
         let mut side = |process, life, open| Side {
             process,
             life,
             links: [
-                EmulatedLink::new(self.path.clone(), self.random.next()),
+                EmulatedLink::new(path.clone(), self.random.next()),
                 EmulatedLink::new(reliable.clone(), self.random.next()),
             ],
             open,
             closed: false,
+            sent: Waiting::default(),
+            received: Waiting::default(),
         };
         let sides = [side(from, lives[0], true), side(to, lives[1], false)];
         self.wires.push(Wire { sides });
@@ -242,8 +267,10 @@ impl Mesh {
         if self.processes.is_down(process, now) {
             return Ok(());
         }
-        if self.processes.is_stalled(process, now) {
-            self.processes.take(process, &[FaultKind::Stall, FaultKind::Starvation], now);
+        self.device(process)?;
+        let stalled = self.processes.take_stalls(process, now);
+        self.transfer(process, stalled);
+        if stalled.app {
             return Ok(());
         }
         if self.nodes[process].session.is_none() {
@@ -266,39 +293,69 @@ impl Mesh {
         self.processes.is_parted(a, self.now) || self.processes.is_parted(b, self.now)
     }
 
-    fn read(&mut self, process: usize) {
-        let own = self.now + self.nodes[process].ahead;
+    /// Runs the loop of the process's device, which ends and begins with it.
+    fn device(&mut self, process: usize) -> Result<(), String> {
+        if process == self.malicious() {
+            return Ok(());
+        }
+        let device = match &mut self.nodes[process].device {
+            Some(device) => device,
+            none => none.insert(DeviceLoop::new(&self.model, process, self.now)?),
+        };
+        let state = self.processes.take_device(process, self.now);
+        self.felt.add(device.run(&self.model, self.now, state)?);
+        Ok(())
+    }
+
+    /// What the thread of a process's network does: it sends what has waited, and receives.
+    fn transfer(&mut self, process: usize, stalled: Stalled) {
+        if stalled.network {
+            return;
+        }
+        let most = if stalled.app { WAITING } else { usize::MAX };
         for index in 0..self.wires.len() {
             for at in 0..2 {
-                if self.wires[index].sides[at].process != process || self.wires[index].sides[at].closed {
+                if self.wires[index].sides[at].process != process {
+                    continue;
+                }
+                while let Some((channel, packet)) = self.wires[index].sides[at].sent.pop() {
+                    self.put((index, at), channel, packet);
+                }
+                if self.wires[index].sides[at].closed {
                     continue;
                 }
                 let parted = self.is_parted(process, self.wires[index].sides[1 - at].process);
-                let peer = PeerId(index as u64);
-                for reliable in [1, 0] {
-                    loop {
-                        if parted && reliable == 1 {
-                            break;
-                        }
-                        let Some(packet) = self.wires[index].sides[1 - at].links[reliable].poll(self.now)
-                        else {
-                            break;
-                        };
-                        let side = &mut self.wires[index].sides[at];
-                        let node = &mut self.nodes[process];
-                        let Some(session) =
-                            node.session.as_mut().filter(|_| side.life == node.life && !parted)
-                        else {
-                            continue;
-                        };
-                        if !side.open && matches!(packet, Packet::Message(_)) {
-                            side.open = session.accept(own, peer, 1200).is_ok();
-                        }
-                        match packet {
-                            Packet::Datagram(bytes) => session.on_datagram(own, peer, &bytes),
-                            Packet::Message(bytes) => session.on_message(own, peer, &bytes),
-                            Packet::Close => session.disconnect(peer, DisconnectReason::Lost),
-                        }
+                let [a, b] = &mut self.wires[index].sides;
+                let (side, other) = if at == 0 { (a, b) } else { (b, a) };
+                while let Some(packet) = (!parted).then(|| other.links[1].poll(self.now)).flatten() {
+                    side.received.push(Channel::Message, packet, most);
+                }
+                while let Some(packet) = other.links[0].poll(self.now) {
+                    if !parted {
+                        side.received.push(Channel::Datagram, packet, most);
+                    }
+                }
+            }
+        }
+    }
+
+    fn read(&mut self, process: usize) {
+        let own = self.now + self.nodes[process].ahead;
+        let node = &mut self.nodes[process];
+        for (index, wire) in self.wires.iter_mut().enumerate() {
+            let peer = PeerId(index as u64);
+            for side in wire.sides.iter_mut().filter(|side| side.process == process && !side.closed) {
+                while let Some((_, packet)) = side.received.pop() {
+                    let Some(session) = node.session.as_mut().filter(|_| side.life == node.life) else {
+                        continue;
+                    };
+                    if !side.open && matches!(packet, Packet::Message(_)) {
+                        side.open = session.accept(own, peer, 1200).is_ok();
+                    }
+                    match packet {
+                        Packet::Datagram(bytes) => session.on_datagram(own, peer, &bytes),
+                        Packet::Message(bytes) => session.on_message(own, peer, &bytes),
+                        Packet::Close => session.disconnect(peer, DisconnectReason::Lost),
                     }
                 }
             }
@@ -308,10 +365,13 @@ impl Mesh {
     /// The hand moves, and the session steps.
     fn work(&mut self, process: usize) {
         let own = self.now + self.nodes[process].ahead;
-        let (vertex, target) = hand(&self.model, process, self.now);
+        let (vertex, mut target) = hand(&self.model, process, self.now);
         let malicious = number(self.malicious());
         let node = &mut self.nodes[process];
         let Some(session) = &mut node.session else { return };
+        if let Some(device) = &node.device {
+            target = device.tool(target);
+        }
         match node.grab {
             None => node.grab = session.begin_grab(BODY, vertex, 0.12, target, hold()).ok(),
             Some(grab) => {
@@ -327,6 +387,11 @@ impl Mesh {
         let honest = body.grabs().iter().filter(|grab| grab.key.user != malicious);
         let force = honest.map(|grab| norm(grab.reaction)).fold(0.0, f64::max);
         let hands = body.grabs().len();
+        if let Some(device) = &mut node.device {
+            let key = node.grab.map(|grab| GrabKey { user: number(process), grab });
+            let own = body.grabs().iter().find(|grab| Some(grab.key) == key);
+            device.publish(own.map(|own| (own.target, own.reaction)), 1.0 / 40.0);
+        }
         let confirmed = session.confirmed();
         if let Some(state) = session.state_at(BODY, confirmed) {
             let size = apart(&state.q, &vec![0.0; state.q.len()]);
@@ -371,6 +436,8 @@ impl Mesh {
                     }
                 }
                 PeerEvent::Joined { user, .. } => {
+                    // Its app keeps the numbers of all.
+                    self.processes.write(process, self.now);
                     self.nodes[process].missed.remove(&process_of(user));
                     let others: Vec<(UserId, String)> = (0..self.nodes.len())
                         .filter(|other| *other != process && self.is_there(process, *other))
@@ -440,6 +507,7 @@ impl Mesh {
             }
         }
         let now = self.now;
+        let stalled = self.processes.stalled(process, now).network;
         for (index, packet) in out {
             let Some(wire) = self.wires.get_mut(index) else { continue };
             let at = usize::from(wire.sides[0].process != process);
@@ -448,20 +516,33 @@ impl Mesh {
             for end in [process, other] {
                 self.processes.take(end, &[FaultKind::Partition, FaultKind::BadNetwork], now);
             }
-            let bad = self.processes.is_disturbed(process, now) || self.processes.is_disturbed(other, now);
-            let link = if bad { disturbed(&self.path) } else { self.path.clone() };
-            let side = &mut wire.sides[at];
-            side.closed |= matches!(packet, Packet::Close);
-            let reliable = usize::from(!matches!(packet, Packet::Datagram(_)));
-            if reliable == 0 && *side.links[0].config() != link {
-                let _ = side.links[0].reconfigure(link);
+            wire.sides[at].closed |= matches!(packet, Packet::Close);
+            let channel =
+                if matches!(packet, Packet::Datagram(_)) { Channel::Datagram } else { Channel::Message };
+            if stalled {
+                wire.sides[at].sent.push(channel, packet, WAITING);
+            } else {
+                self.put((index, at), channel, packet);
             }
-            let size = match &packet {
-                Packet::Datagram(bytes) | Packet::Message(bytes) => bytes.len(),
-                Packet::Close => 0,
-            };
-            side.links[reliable].send(now, packet, size);
         }
+    }
+
+    /// Sends from one side of a connection.
+    fn put(&mut self, (index, at): (usize, usize), channel: Channel, packet: Packet) {
+        let now = self.now;
+        let sides = &mut self.wires[index].sides;
+        let bad = sides.iter().any(|side| self.processes.is_disturbed(side.process, now));
+        let link = &mut sides[at].links[usize::from(channel == Channel::Message)];
+        let path = if bad { disturbed(&self.path) } else { self.path.clone() };
+        let path = LinkConfig { delay: link.config().delay, ..path };
+        if channel == Channel::Datagram && *link.config() != path {
+            let _ = link.reconfigure(path);
+        }
+        let size = match &packet {
+            Packet::Datagram(bytes) | Packet::Message(bytes) => bytes.len(),
+            Packet::Close => 0,
+        };
+        link.send(now, packet, size);
     }
 
     /// Calls those who are missed, and somebody to join by.

@@ -2,8 +2,15 @@
 //! follows from a seed, and so does all else.
 //!
 //! The even seeds are a host with guests, the odd ones a mesh of peers. The last of them is
-//! malicious. What must hold is checked in every tick, and once more a while after the last fault.
+//! malicious. The others hold the body with a simulated device, whose loop has a thread of its own
+//! as the app and the network have. What must hold is checked in every tick and in every period of
+//! a device, and once more a while after the last fault.
+//!
+//! Of files, the sessions of `pliant_net` write recordings only, on a thread of their own, whose
+//! bounded queue no frame waits for. An app writes the numbers of users and the models that came:
+//! these are what a slow disk delays here.
 
+mod device;
 mod mesh;
 mod mischief;
 mod schedule;
@@ -57,6 +64,8 @@ pub struct SimulateSettings {
     pub from: u64,
     /// Number of seeds.
     pub seeds: u64,
+    /// The kinds of faults that are drawn. Other kinds make other sessions of the same seeds.
+    pub kinds: &'static [FaultKind],
     /// Returns the memory that this thread has allocated and not freed, bytes. With it, the memory
     /// of each session is bounded. Default: none.
     pub memory: Option<fn() -> i64>,
@@ -92,6 +101,13 @@ pub struct SimulateReport {
     pub largest_memory: [i64; 2],
     /// Largest reaction that a guest's hand was told of, over the largest true one of its session.
     pub largest_share: f64,
+    /// Periods of all loops of devices.
+    pub device_periods: u64,
+    /// Largest force of a device, N, and the largest rise of a force in a period over the slew
+    /// limit of its device.
+    pub largest_force: f64,
+    /// See [`largest_force`](Self::largest_force).
+    pub largest_rise: f64,
     /// What broke.
     pub failures: Vec<Failure>,
     /// Running time, s.
@@ -103,6 +119,7 @@ pub struct SimulateReport {
 struct Outcome {
     ticks: u64,
     share: f64,
+    felt: device::Felt,
     took: Vec<FaultKind>,
     digest: Digest,
     memory: [i64; 2],
@@ -160,13 +177,14 @@ pub fn simulate(
     let began = Instant::now();
     let model = body()?;
     let mut report = SimulateReport { seeds: settings.seeds, ..SimulateReport::default() };
-    let (memory, mut digest) = (settings.memory, Digest::EMPTY);
+    let mut digest = Digest::EMPTY;
+    let mut felt = device::Felt::default();
     // In chunks, so that progress can be reported.
     let end = settings.from.saturating_add(settings.seeds);
     let mut next = settings.from;
     while next < end {
         let until = next.saturating_add(64).min(end);
-        let all = (next..until).into_par_iter().map(|seed| (seed, session(seed, &model, memory)));
+        let all = (next..until).into_par_iter().map(|seed| (seed, session(seed, &model, settings)));
         let done: Vec<_> = all.collect();
         for (seed, (faults, outcome)) in done {
             report.virtual_seconds += END.as_secs_f64();
@@ -181,6 +199,7 @@ pub fn simulate(
                         *largest = memory.max(*largest);
                     }
                     report.ticks += outcome.ticks;
+                    felt.add(outcome.felt);
                     report.largest_share = report.largest_share.max(outcome.share);
                 }
                 Err(what) => {
@@ -194,6 +213,8 @@ pub fn simulate(
     }
     report.seconds = began.elapsed().as_secs_f64();
     report.digest = digest.0;
+    report.device_periods = felt.periods;
+    (report.largest_force, report.largest_rise) = (felt.force, felt.rise);
     Ok(report)
 }
 
@@ -201,12 +222,12 @@ pub fn simulate(
 fn session(
     seed: u64,
     model: &Arc<ModalModel>,
-    probe: Option<fn() -> i64>,
+    settings: &SimulateSettings,
 ) -> (Vec<SimulatedFault>, Result<Outcome, String>) {
     let mut random = schedule::Random::new(seed);
     let processes = 3 + random.index(2);
-    let faults = schedule::schedule(&mut random, processes, FAULTS[0], FAULTS[1]);
-    let memory = Memory::new(probe);
+    let faults = schedule::schedule(&mut random, settings.kinds, processes, FAULTS);
+    let memory = Memory::new(settings.memory);
     let run = || match seed % 2 {
         0 => star::run(model, seed, processes, &faults, (random.clone(), memory)),
         _ => mesh::run(model, seed, processes, &faults, (random.clone(), memory)),

@@ -59,11 +59,26 @@ pub enum FaultKind {
     Replay,
     /// A member of the session sends thousands of datagrams and grabs a second.
     Flood,
+    /// The thread of the app's frames stands still. The network's thread and the device's loop go
+    /// on.
+    AppStall,
+    /// The network's thread stands still. Frames and the device's loop go on.
+    NetworkStall,
+    /// The thread of the device's loop stands still, and its motors hold the last force.
+    DeviceStall,
+    /// The device is unplugged and plugged in again.
+    DeviceLost,
+    /// The disk answers late. Who writes a file within a frame, as an app does that keeps the
+    /// numbers of users or a model when somebody comes, loses the frames until it does.
+    SlowDisk,
+    /// The process tries to connect over a slow path, gives that up and connects anew. What belongs
+    /// to the old attempt arrives after the new one.
+    LateReconnect,
 }
 
 impl FaultKind {
     /// All kinds.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 16] = [
         Self::Crash,
         Self::Stall,
         Self::Starvation,
@@ -74,7 +89,16 @@ impl FaultKind {
         Self::Garbage,
         Self::Replay,
         Self::Flood,
+        Self::AppStall,
+        Self::NetworkStall,
+        Self::DeviceStall,
+        Self::DeviceLost,
+        Self::SlowDisk,
+        Self::LateReconnect,
     ];
+
+    /// Those of whole processes, of networks and of malicious members.
+    pub const PROCESSES: &'static [Self] = Self::ALL.split_at(10).0;
 
     /// The name in reports.
     pub fn name(self) -> &'static str {
@@ -89,6 +113,12 @@ impl FaultKind {
             Self::Garbage => "garbage",
             Self::Replay => "replay",
             Self::Flood => "flood",
+            Self::AppStall => "stall of the app",
+            Self::NetworkStall => "stall of the network",
+            Self::DeviceStall => "stall of the device",
+            Self::DeviceLost => "device lost",
+            Self::SlowDisk => "slow disk",
+            Self::LateReconnect => "late reconnect",
         }
     }
 
@@ -114,31 +144,34 @@ pub struct SimulatedFault {
 impl fmt::Display for SimulatedFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (at, lasts) = (self.at.as_secs_f64(), self.lasts.as_secs_f64());
-        write!(f, "{at:7.3} s  {:<17}  process {}  {lasts:.3} s", self.kind.name(), self.process)
+        write!(f, "{at:7.3} s  {:<20}  process {}  {lasts:.3} s", self.kind.name(), self.process)
     }
 }
 
-/// Draws the faults of a session in order of time. They begin between `from` and `to`, and the
-/// last of `processes` is malicious.
+/// Draws the faults of a session, of some kinds, in order of time. They begin between `from` and
+/// `to`, and the last of `processes` is malicious.
 pub(super) fn schedule(
     random: &mut Random,
+    kinds: &[FaultKind],
     processes: usize,
-    from: Duration,
-    to: Duration,
+    [from, to]: [Duration; 2],
 ) -> Vec<SimulatedFault> {
     let span = u64::try_from((to.saturating_sub(from)).as_millis()).unwrap_or(1);
     let mut faults: Vec<SimulatedFault> = (0..random.range(4, 13))
         .map(|_| {
             let at = from + random.millis(0, span);
-            let kind = FaultKind::ALL[random.index(FaultKind::ALL.len())];
+            let kind = kinds[random.index(kinds.len())];
             let process = if kind.is_attack() { processes - 1 } else { random.index(processes - 1) };
             let lasts = match kind {
                 FaultKind::Crash => random.millis(100, 5000),
-                FaultKind::Stall => random.millis(10, 2000),
+                FaultKind::Stall | FaultKind::AppStall | FaultKind::NetworkStall | FaultKind::DeviceStall => {
+                    random.millis(10, 2000)
+                }
                 FaultKind::ClockJump => random.millis(1, 5000),
                 FaultKind::SecondConnection => Duration::ZERO,
                 FaultKind::Starvation | FaultKind::BadNetwork => random.millis(300, 3000),
-                FaultKind::Partition => random.millis(50, 6000),
+                FaultKind::Partition | FaultKind::SlowDisk => random.millis(50, 6000),
+                FaultKind::DeviceLost | FaultKind::LateReconnect => random.millis(200, 3000),
                 FaultKind::Garbage | FaultKind::Replay | FaultKind::Flood => random.millis(100, 3000),
             };
             SimulatedFault { at, kind, process, lasts }

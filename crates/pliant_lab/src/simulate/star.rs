@@ -9,9 +9,11 @@ use pliant_stream::emulator::LinkConfig;
 use pliant_stream::wire::GuestMessage;
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GrabKey, GrabState, GuestEvent, GuestSession, GuestSessionConfig,
-    HandPlayout, HostEvent, HostSession, HostSessionConfig, Role, StepSettings, TickState, UserId,
+    HandPlayout, HostEvent, HostSession, HostSessionConfig, Role, StepSettings, StreamError, TickState,
+    UserId,
 };
 
+use super::device::{DeviceLoop, Felt};
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::Processes;
@@ -19,7 +21,7 @@ use super::{
     AGREES, COMPARED, Digest, END, FaultKind, IDLE, LOOK, MAX_FORCE, MAX_MEMORY, Memory, Outcome,
     SimulatedFault, apart, hand, hold, norm,
 };
-use crate::pair::{Pair, PathConfig, World};
+use crate::pair::{Pair, PathConfig, Stalled, World};
 
 const BODY: BodyId = BodyId(1);
 /// A host plays hands back two ticks late, and leads them by no more than this in a tick, m.
@@ -55,6 +57,11 @@ struct Apps {
     guests: Vec<(usize, Option<u16>, Duration)>,
     /// The largest reactions of each process's hand: shown, and true, N.
     largest: Vec<(f64, f64)>,
+    /// The devices of the guests' processes.
+    devices: Vec<Option<DeviceLoop>>,
+    felt: Felt,
+    /// The processes whose apps have just written a file.
+    wrote: Vec<usize>,
     mischief: Mischief,
     random: Random,
     ticks: u64,
@@ -147,6 +154,7 @@ impl World for Apps {
     fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
         match event {
             HostEvent::JoinRequest { peer, name } => {
+                self.wrote.push(0);
                 // One name is one user, and a new connection takes the place of an older one.
                 let older = host.users().find(|(_, _, other)| **other == *name).map(|(older, ..)| older);
                 if let Some(older) = older {
@@ -155,7 +163,9 @@ impl World for Apps {
                 let next = self.known.values().map(|user| user.0).max().unwrap_or(0) + 1;
                 let number = *self.known.entry(name).or_insert(UserId(next));
                 let given = host.accept_as(now, peer, Some(number), Role::Hold);
-                self.ensure(given == Ok(number), || format!("user {} becomes {given:?}", number.0));
+                // It may have gone while the host stood still. The event of that follows.
+                let gone = given == Err(StreamError::UnknownPeer(peer));
+                self.ensure(given == Ok(number) || gone, || format!("user {} becomes {given:?}", number.0));
             }
             HostEvent::GrabBegan { key, vertex, radius, target, hold, .. } => {
                 let state = GrabState { key, vertex, radius, target, reaction: [0.0; 3], hold };
@@ -182,6 +192,7 @@ impl World for Apps {
     fn guest_event(&mut self, _now: Duration, guest: usize, event: GuestEvent, _session: &mut GuestSession) {
         let (process, grab, _) = self.guests[guest];
         match event {
+            GuestEvent::ModelCame { .. } => self.wrote.push(process),
             GuestEvent::GrabRefused { grab: refused } if grab == Some(refused) => {
                 self.ensure(process == self.malicious(), || format!("{} may not hold", name(process)));
                 self.guests[guest].1 = None;
@@ -217,7 +228,14 @@ impl World for Apps {
                 self.largest[process].0 = self.largest[process].0.max(force);
             }
         }
-        let (vertex, target) = hand(&self.model, process, self.now);
+        let (vertex, mut target) = hand(&self.model, process, self.now);
+        if let Some(device) = &mut self.devices[process] {
+            let shown = grab.map(|grab| GrabKey { user, grab });
+            let shown = view.grabs().iter().find(|grab| Some(grab.key) == shown);
+            let told = shown.and_then(|own| Some((own.target, view.hand_reaction(user, own.key.grab)?)));
+            device.publish(told, session.step());
+            target = device.tool(target);
+        }
         match grab {
             None => {
                 self.guests[guest].1 = session.begin_grab(now, BODY, vertex, 0.12, target, hold()).ok();
@@ -245,6 +263,8 @@ struct Star {
     guest: Vec<Option<usize>>,
     /// When a process that has lost its session tries again.
     again: Vec<Option<Duration>>,
+    /// By how much the path of a process's next attempt is slower, which it gives up at once.
+    late: Vec<Option<Duration>>,
     host_was_down: bool,
     /// Looks of the last second at which a process showed a tick that the host has made.
     compared: Vec<u32>,
@@ -284,6 +304,9 @@ pub(super) fn run(
         truth: VecDeque::new(),
         guests: Vec::new(),
         largest: vec![(0.0, 0.0); count],
+        devices: std::iter::repeat_with(|| None).take(count).collect(),
+        felt: Felt::default(),
+        wrote: Vec::new(),
         mischief: Mischief::default(),
         random: Random::new(!seed),
         ticks: 0,
@@ -298,6 +321,7 @@ pub(super) fn run(
         processes: Processes::default(),
         guest: vec![None; count],
         again: vec![Some(Duration::ZERO); count],
+        late: vec![None; count],
         host_was_down: false,
         compared: vec![0; count],
         path,
@@ -337,6 +361,7 @@ pub(super) fn run(
     Ok(Outcome {
         ticks: star.apps.ticks,
         share,
+        felt: star.apps.felt,
         took: star.processes.took(),
         digest: star.apps.digest,
         memory: [memory.largest, held],
@@ -346,12 +371,21 @@ pub(super) fn run(
 impl Star {
     fn begin(&mut self, fault: SimulatedFault) {
         self.processes.begin(fault);
+        if fault.kind == FaultKind::Crash {
+            self.apps.devices[fault.process] = None;
+        }
         match (fault.kind, self.guest[fault.process]) {
             (FaultKind::ClockJump, None) => self.pair.jump_host(fault.lasts),
             (FaultKind::ClockJump, Some(guest)) => self.pair.jump_guest(guest, fault.lasts),
             (FaultKind::SecondConnection | FaultKind::Crash, Some(guest)) => {
                 self.pair.cut(guest);
                 self.again[fault.process] = Some(fault.at);
+            }
+            (FaultKind::LateReconnect, Some(guest)) => {
+                self.pair.cut(guest);
+                self.late[fault.process] = Some(fault.lasts);
+                self.again[fault.process] = Some(fault.at);
+                return;
             }
             // The host's own end is in `look`.
             (FaultKind::Crash, None) => {}
@@ -370,15 +404,15 @@ impl Star {
             self.apps.truth.clear();
         }
         self.host_was_down = down;
-        let host_stalls = down || self.processes.is_stalled(0, now);
-        let slow = [FaultKind::Stall, FaultKind::Starvation];
-        if host_stalls && !down {
-            self.processes.take(0, &slow, now);
+        for process in std::mem::take(&mut self.apps.wrote) {
+            self.processes.write(process, now);
         }
-        self.pair.stall_host(host_stalls);
+        let host = if down { Stalled::from(true) } else { self.processes.take_stalls(0, now) };
+        self.pair.stall_host(host);
         let malicious = self.apps.malicious();
         for process in 1..self.guest.len() {
-            let stalled = self.processes.is_stalled(process, now);
+            let stalled = self.processes.stalled(process, now);
+            self.device(process, now)?;
             let parted = self.processes.is_parted(process, now) || self.processes.is_parted(0, now);
             if let Some(guest) = self.guest[process] {
                 self.pair.stall_guest(guest, stalled);
@@ -386,9 +420,7 @@ impl Star {
                 if self.pair.guests[guest].session.user().is_some() {
                     self.processes.take(process, &[FaultKind::Partition, FaultKind::BadNetwork], now);
                     self.processes.take(0, &[FaultKind::Partition, FaultKind::BadNetwork], now);
-                    if stalled {
-                        self.processes.take(process, &slow, now);
-                    }
+                    self.processes.take_stalls(process, now);
                 }
                 let bad = self.processes.is_disturbed(process, now) || self.processes.is_disturbed(0, now);
                 let link = if bad { super::state::disturbed(&self.path) } else { self.path.clone() };
@@ -406,7 +438,8 @@ impl Star {
                 }
             }
             let due = self.again[process].is_some_and(|again| again <= now);
-            if due && !host_stalls && !stalled && !parted && !self.processes.is_down(process, now) {
+            let runs = host == Stalled::default() && stalled == host;
+            if due && runs && !parted && !self.processes.is_down(process, now) {
                 self.connect(process)?;
             }
         }
@@ -414,12 +447,37 @@ impl Star {
         Ok(())
     }
 
+    /// Runs the loop of a guest's device, which ends and begins with its process.
+    fn device(&mut self, process: usize, now: Duration) -> Result<(), String> {
+        if process == self.apps.malicious() || self.processes.is_down(process, now) {
+            return Ok(());
+        }
+        let apps = &mut self.apps;
+        let device = match &mut apps.devices[process] {
+            Some(device) => device,
+            none => none.insert(DeviceLoop::new(&apps.model, process, now)?),
+        };
+        apps.felt.add(device.run(&apps.model, now, self.processes.take_device(process, now))?);
+        Ok(())
+    }
+
     fn connect(&mut self, process: usize) -> Result<(), String> {
+        if let Some(slower) = self.late[process].take() {
+            self.attempt(process, slower)?;
+            let late = self.guest[process].take();
+            late.into_iter().for_each(|late| self.pair.abandon(late));
+            self.processes.take(process, &[FaultKind::LateReconnect], self.apps.now);
+        }
+        self.attempt(process, Duration::ZERO)
+    }
+
+    /// Lets a process connect over a path that is slower by so much.
+    fn attempt(&mut self, process: usize, slower: Duration) -> Result<(), String> {
         if let Some(before) = self.guest[process] {
             self.pair.cut(before);
         }
         let config = GuestSessionConfig { name: name(process), idle_timeout: IDLE, ..Default::default() };
-        let path = PathConfig::symmetric(self.path.clone());
+        let path = PathConfig::symmetric(LinkConfig { delay: self.path.delay + slower, ..self.path.clone() });
         let model = self.apps.model.clone();
         // Every second guest has the model already.
         let cached = move |session: &mut GuestSession| {

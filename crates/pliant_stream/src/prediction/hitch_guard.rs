@@ -6,7 +6,7 @@
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
 //! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
 //! second, until the host has the hand where this guest sent it. The same holds for a second after
-//! another's hand has come or gone, and after an event that has changed what the copy predicts by
+//! another's hand has come or gone, after a jump of the hand itself, and after an event that has changed what the copy predicts by
 //! more than a twentieth of that measure. Where no frame comes at all, the reaction fades.
 
 use std::collections::VecDeque;
@@ -99,6 +99,12 @@ impl HitchGuard {
         if held > self.second / 2 {
             self.bounded_until = self.bounded_until.max(now + AFTER);
         }
+    }
+
+    /// Bounds for a second, as [`HitchGuard::disturb`] does, because the hand itself has jumped:
+    /// its device stood still, or was away.
+    pub(crate) fn jump(&mut self) {
+        self.called.into_iter().for_each(|now| self.disturb(now));
     }
 
     /// Bounds for a second, as [`HitchGuard::disturb`] does, where an event from the host has

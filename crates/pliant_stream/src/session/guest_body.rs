@@ -46,7 +46,7 @@ pub struct StreamedBody {
     pub(crate) playout: PlayoutClock,
     pub(crate) predicted: Option<PredictedHand>,
     predicts: bool,
-    hitches: HitchGuard,
+    pub(super) hitches: HitchGuard,
     /// Digest of the other users' hands at the last tick that was received.
     other_hands: u64,
     config: RecoveryConfig,

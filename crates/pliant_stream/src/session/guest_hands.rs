@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use nalgebra::Vector3;
 use pliant_modal::GrabConfig;
 
 use super::MIN_DATAGRAM;
@@ -13,6 +14,12 @@ use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets, che
 
 /// Interval at which an unchanged target is sent again.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
+/// A hand jumps when its way from one target to the next is farther than this share of the body's
+/// size, and farther than its longest way of late by this factor. The host eases such a jump, as a
+/// [`HandPlayout`](crate::HandPlayout) does.
+const JUMP: [f64; 2] = [0.05, 1.5];
+/// Factor by which a way is forgotten from one target to the next.
+const FORGETTING: f64 = 0.98;
 /// Number of recent targets of a grab in each datagram.
 pub(super) const TARGET_REPEATS: usize = 3;
 
@@ -21,6 +28,9 @@ pub(super) struct LocalGrab {
     pub(super) body: BodyId,
     /// The recent targets, newest last, at most three.
     targets: VecDeque<TargetEntry>,
+    /// The last target, and the longest way from one to the next of late, m.
+    last: Vector3<f64>,
+    usual: f64,
     fresh: bool,
     sent_at: Duration,
 }
@@ -72,7 +82,9 @@ impl GuestSession {
             return Err(StreamError::Full { what: "grabs", limit });
         }
         let grab = next_free(&mut self.next_grab, |grab| !self.grabs.contains_key(&grab));
-        self.grabs.insert(grab, LocalGrab { body, targets: VecDeque::new(), fresh: false, sent_at: now });
+        let (targets, last) = (VecDeque::new(), target.into());
+        let own = LocalGrab { body, targets, last, usual: 0.0, fresh: false, sent_at: now };
+        self.grabs.insert(grab, own);
         if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
             predicted.begin(grab, vertex, radius, target, hold);
         }
@@ -97,9 +109,16 @@ impl GuestSession {
         self.input = self.input.wrapping_add(1);
         own.targets.push_back(TargetEntry { grab, input: self.input, target });
         own.fresh = true;
-        let body = own.body;
-        if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
-            predicted.set(grab, target);
+        let target = Vector3::from(target);
+        let way = (target - std::mem::replace(&mut own.last, target)).norm();
+        let fastest = JUMP[1] * own.usual;
+        own.usual = way.max(FORGETTING * own.usual);
+        let Some(body) = self.bodies.get_mut(&own.body) else { return Ok(()) };
+        if way > fastest && body.model().is_some_and(|model| way > JUMP[0] * model.size()) {
+            body.hitches.jump();
+        }
+        if let Some(predicted) = body.predicted.as_mut() {
+            predicted.set(grab, target.into());
         }
         Ok(())
     }
