@@ -52,11 +52,19 @@ fn reduced(model: &Arc<ModalModel>, step: f64, damping_scale: f64) -> Body {
 
 /// Leads hands to where they stay, slowly, and lets the body come to rest.
 fn lead(body: &mut Body, hands: &[(GrabId, Vector)]) {
+    lead_with(body, hands, false);
+}
+
+/// The same, with shapes that are made on the way if the body is to have them.
+fn lead_with(body: &mut Body, hands: &[(GrabId, Vector)], has_shapes: bool) {
     let starts: Vec<Vector> = hands.iter().map(|(grab, _)| body.target(*grab).unwrap()).collect();
     for i in 1..=1_200 {
         let share = (f64::from(i) / 600.0).min(1.0);
         for ((grab, way), start) in hands.iter().zip(&starts) {
             body.set_target(*grab, std::array::from_fn(|k| start[k] + share * way[k])).unwrap();
+        }
+        if has_shapes {
+            body.make_held_shapes().unwrap();
         }
         body.step().unwrap();
     }
@@ -75,17 +83,14 @@ fn errors(
         .collect();
     let loads = StaticLoads { prescribed: &held, ..Default::default() };
     let full = deflect(mesh, config, Material::NeoHookean, &loads).unwrap();
-    let patches: Vec<Patch> = hands.iter().map(|(patch, _)| patch.clone()).collect();
-    let shapes = HeldShapes::new(model, &patches).unwrap().map(Arc::new);
-    assert!(shapes.is_some());
-    [None, shapes].map(|shapes| {
+    [false, true].map(|has_shapes| {
         let mut body = reduced(model, 1.0 / 60.0, 30.0);
         let grabs: Vec<(GrabId, Vector)> = hands
             .iter()
             .map(|(patch, way)| (body.grab(patch, GrabConfig::default()).unwrap(), *way))
             .collect();
-        body.set_held_shapes(shapes).unwrap();
-        lead(&mut body, &grabs);
+        lead_with(&mut body, &grabs, has_shapes);
+        assert_eq!(body.held_shapes().is_some(), has_shapes);
         let size = full.reactions.iter().map(|&force| norm(force)).fold(0.0, f64::max);
         let off = grabs.iter().zip(&full.reactions);
         let off = off.map(|((grab, _), want)| norm(minus(body.reaction(*grab).unwrap(), *want)));
@@ -108,10 +113,10 @@ fn shapes_of_the_patch_give_the_force_and_the_dent() {
     type Row = (&'static str, Vector, f64, Vector, [f64; 2]);
     let rows: [Row; 5] = [
         ("corner of the end by .08", [1.0, 0.1, 0.1], 0.05, [0.0, 0.056, 0.056], [5e-3, 1e-3]),
-        ("corner of the end by .28", [1.0, 0.1, 0.1], 0.05, [0.0, 0.196, 0.196], [0.01, 5e-3]),
-        ("side of the middle by .08", [0.5, 0.1, 0.05], 0.05, [0.0, 0.08, 0.0], [5e-3, 2e-3]),
-        // A bar that is led so far by its middle bends in more ways than the coordinates have.
-        ("side of the middle by .28", [0.5, 0.1, 0.05], 0.05, [0.0, 0.28, 0.0], [0.08, 0.03]),
+        ("corner of the end by .28", [1.0, 0.1, 0.1], 0.05, [0.0, 0.196, 0.196], [5e-3, 2e-3]),
+        ("side of the middle by .08", [0.5, 0.1, 0.05], 0.05, [0.0, 0.08, 0.0], [0.01, 2e-3]),
+        // With shapes of the patch at rest alone, the force is off by 5 %.
+        ("side of the middle by .28", [0.5, 0.1, 0.05], 0.05, [0.0, 0.28, 0.0], [0.035, 0.01]),
         ("end, sideways by .5", [1.0, 0.05, 0.05], 0.08, [0.0, 0.5, 0.0], [0.03, 0.01]),
     ];
     for (name, at, radius, way, bounds) in rows {
@@ -125,7 +130,65 @@ fn shapes_of_the_patch_give_the_force_and_the_dent() {
     ];
     let [without, with] = errors(&mesh, &config(), &model, &two);
     println!("two hands that shear: {with:.4?}, without the shapes {without:.4?}");
-    assert!(with[0] < 0.03 && with[1] < 2e-3, "{with:?}");
+    assert!(with[0] < 0.02 && with[1] < 1e-3, "{with:?}");
+}
+
+/// The columns have to follow the hands: with those of hands at rest, the force of the second row
+/// is off by 11 to 24 %.
+#[test]
+fn four_hands_that_twist_a_bar_feel_the_full_solution() {
+    let mesh = slender();
+    let model = model(&mesh, &config());
+    for (way, bounds) in [(0.015, [0.05, 1e-3]), (0.07, [0.03, 3e-3])] {
+        let hands = [[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1]].map(|[y, z]| {
+            let patch = Patch::around(model.surface(), vertex(&model, [1.0, y, z]), 0.03).unwrap();
+            let size = (y - 0.05f64).hypot(z - 0.05);
+            (patch, [0.0, -way * (z - 0.05) / size, way * (y - 0.05) / size])
+        });
+        let [without, with] = errors(&mesh, &config(), &model, &hands);
+        println!("twisted by {way}: force and surface off by {with:.4?}, without {without:.4?}");
+        assert!(with[0] < bounds[0] && with[1] < bounds[1], "{way}: {with:?}");
+    }
+}
+
+/// Columns are made anew while the hand goes on. It feels no kicks, and whoever leads a body out and
+/// back gets no energy from it.
+#[test]
+fn columns_that_follow_a_hand_give_it_no_kicks_and_no_energy() {
+    let model = model(&slender(), &config());
+    let patch = Patch::around(model.surface(), vertex(&model, [0.5, 0.1, 0.05]), 0.05).unwrap();
+    let mut body = reduced(&model, 1.0 / 60.0, 10.0);
+    let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+    let start = body.target(grab).unwrap();
+    let (mut last, mut work, mut most, mut kick, mut made) = ([0.0; 3], 0.0, 0.0f64, 0.0f64, 0);
+    let mut strongest = 0.0f64;
+    let mut at = start;
+    for i in 1..=2_400 {
+        let turn = std::f64::consts::TAU * f64::from(i) / 1_200.0;
+        let way = [0.0, 0.1 * (1.0 - turn.cos()), 0.06 * turn.sin()];
+        let to = std::array::from_fn(|k| start[k] + way[k]);
+        body.set_target(grab, to).unwrap();
+        let is_new = body.make_held_shapes().unwrap();
+        made += usize::from(is_new);
+        body.step().unwrap();
+        let force = body.reaction(grab).unwrap();
+        let step = norm(minus(force, last));
+        if is_new && i > 60 {
+            kick = kick.max(step);
+        }
+        work += (0..3).map(|k| -0.5 * (force[k] + last[k]) * (to[k] - at[k])).sum::<f64>();
+        most = most.max(body.energy());
+        strongest = strongest.max(norm(force));
+        (last, at) = (force, to);
+    }
+    println!(
+        "{made} sets of columns; the force changes by {:.2} % of the largest where they change; \
+         two rounds take {work:.4} J of work, and {most:.4} J are stored at most",
+        100.0 * kick / strongest
+    );
+    assert!((4..60).contains(&made), "{made}");
+    assert!(kick < 0.05 * strongest, "{kick} of {strongest} N");
+    assert!(work > -0.01 * most, "the hand gets {} of {most} J", -work);
 }
 
 #[test]

@@ -6,16 +6,17 @@ use bevy::{
     prelude::*,
     tasks::{AsyncComputeTaskPool, Task, block_on, poll_once},
 };
-use pliant_modal::{HeldShapes, ModalModel, ModelHash, Patch};
+use pliant_modal::{HeldPlace, HeldShapes, ModalModel, ModelHash};
 
 use crate::{BodyState, Driven, ModalBody};
 
 /// The own shapes of the patches that hands hold, of all bodies with reduced elasticity.
 ///
 /// Shapes take up to some seconds to make. They are made on Bevy's compute threads when a hand
-/// takes hold. Until they are there the hand feels what the coordinates of the model leave out as a
-/// mere compliance. Shapes that were made once stay for the next time that the same patches are
-/// held, as long as they are among the last 32.
+/// takes hold, and made anew for where the hand is when it has led the patch farther
+/// ([`HeldShapes::wanted`]); the old ones serve until then. Until there are any, the hand feels what
+/// the coordinates of the model leave out as a mere compliance. Shapes that were made once stay for
+/// the next time that the same patches are held about there, as long as they are among the last 32.
 #[derive(Resource, Default)]
 pub struct HeldShapesCache {
     /// The entry that was used last is at the end.
@@ -31,7 +32,7 @@ const MAX_MAKING: usize = 4;
 
 struct Entry {
     model: ModelHash,
-    patches: Vec<(u32, u64)>,
+    places: Vec<HeldPlace>,
     shapes: Making,
 }
 
@@ -41,20 +42,15 @@ enum Making {
 }
 
 impl HeldShapesCache {
-    /// Returns the shapes of patches of a model, given by center vertex and radius (m, model).
+    /// Returns the shapes of held patches of a model.
     ///
     /// The result is `None` while they are being made, which the first call begins, and
-    /// `Some(None)` where there are none: see [`HeldShapes::new`].
-    pub fn get(
-        &mut self,
-        model: &Arc<ModalModel>,
-        patches: &[(u32, f64)],
-    ) -> Option<Option<Arc<HeldShapes>>> {
+    /// `Some(None)` where there are none: see [`HeldShapes::of_places`].
+    pub fn get(&mut self, model: &Arc<ModalModel>, places: &[HeldPlace]) -> Option<Option<Arc<HeldShapes>>> {
         let has_mesh = model.parts().reduced.as_ref().is_some_and(|reduced| reduced.mesh.is_some());
-        if patches.is_empty() || patches.len() > HeldShapes::MAX_PATCHES || !has_mesh {
+        if places.is_empty() || places.len() > HeldShapes::MAX_PATCHES || !has_mesh {
             return Some(None);
         }
-        let key: Vec<(u32, u64)> = patches.iter().map(|(v, radius)| (*v, radius.to_bits())).collect();
         for entry in &mut self.entries {
             if let Making::Task(task) = &mut entry.shapes
                 && let Some(shapes) = block_on(poll_once(task))
@@ -63,10 +59,10 @@ impl HeldShapesCache {
             }
         }
         let is_made = |entry: &Entry| matches!(entry.shapes, Making::Done(_));
-        let entry = match self.entries.iter().position(|e| e.model == model.hash() && e.patches == key) {
+        let entry = match self.entries.iter().position(|e| e.model == model.hash() && e.places == places) {
             Some(index) => self.entries.remove(index),
             None if self.entries.iter().filter(|e| !is_made(e)).count() >= MAX_MAKING => return None,
-            None => Entry { model: model.hash(), shapes: begin(model, patches), patches: key },
+            None => Entry { model: model.hash(), shapes: begin(model, places), places: places.to_vec() },
         };
         let result = match &entry.shapes {
             Making::Done(shapes) => Some(shapes.clone()),
@@ -83,23 +79,16 @@ impl HeldShapesCache {
 
     /// Returns the shapes that a body should change to, if it should change.
     ///
-    /// `patches` are those that hands hold, in any order; no more than
+    /// `held` are the patches that hands hold, in any order; no more than
     /// [`HeldShapes::MAX_PATCHES`] of them get shapes. `own` are the shapes that the body has.
     pub fn change(
         &mut self,
         model: &Arc<ModalModel>,
-        patches: impl IntoIterator<Item = (u32, f64)>,
+        held: impl IntoIterator<Item = HeldPlace>,
         own: Option<&Arc<HeldShapes>>,
     ) -> Option<Option<Arc<HeldShapes>>> {
-        let mut patches: Vec<(u32, f64)> = patches.into_iter().take(HeldShapes::MAX_PATCHES).collect();
-        // Equal sets of patches share their shapes.
-        patches.sort_unstable_by_key(|&(vertex, radius)| (vertex, radius.to_bits()));
-        patches.dedup();
-        let has = own.map_or(patches.is_empty(), |own| own.patches().eq(patches.iter().copied()));
-        if has {
-            return None;
-        }
-        self.get(model, &patches).filter(|shapes| shapes.is_some() || own.is_some())
+        let places = HeldShapes::wanted(model, held, own.map(|own| &**own))?;
+        self.get(model, &places).filter(|shapes| shapes.is_some() || own.is_some())
     }
 
     /// Whether shapes are being made.
@@ -108,13 +97,10 @@ impl HeldShapesCache {
     }
 }
 
-fn begin(model: &Arc<ModalModel>, patches: &[(u32, f64)]) -> Making {
-    let (model, patches) = (model.clone(), patches.to_vec());
-    Making::Task(AsyncComputeTaskPool::get().spawn(async move {
-        let around = |&(vertex, radius): &(u32, f64)| Patch::around(model.surface(), vertex, radius).ok();
-        let patches: Vec<Patch> = patches.iter().map(around).collect::<Option<_>>()?;
-        HeldShapes::new(&model, &patches).ok().flatten()
-    }))
+fn begin(model: &Arc<ModalModel>, places: &[HeldPlace]) -> Making {
+    let (model, places) = (model.clone(), places.to_vec());
+    let make = async move { HeldShapes::of_places(&model, &places).ok().flatten() };
+    Making::Task(AsyncComputeTaskPool::get().spawn(make))
 }
 
 /// Gives the held bodies the shapes of their patches as soon as these are made.
@@ -129,8 +115,8 @@ pub(crate) fn shape_held(
         }
         // Fewer coordinates than the model has are stepped without shapes.
         let takes = wanted.held_shapes && body.mode_count() == body.model().mode_count();
-        let patches = body.held_patches().filter(|_| takes);
-        if let Some(shapes) = cache.change(body.model(), patches, body.held_shapes()) {
+        let held = body.held_places().filter(|_| takes);
+        if let Some(shapes) = cache.change(body.model(), held, body.held_shapes()) {
             // The shapes are of this model, so that this cannot fail.
             let _ = state.body_mut().set_held_shapes(shapes);
         }

@@ -4,8 +4,7 @@ use std::{sync::Arc, time::Instant};
 
 use nalgebra::{Matrix3, Vector3};
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, HeldShapes, Material, ModalModel, ModelError, Patch,
-    StepSettings,
+    Body, BodyConfig, Elasticity, GrabConfig, Material, ModalModel, ModelError, Patch, StepSettings,
 };
 use serde::Serialize;
 
@@ -61,8 +60,9 @@ pub struct Pulled {
     pub elasticity: Elasticity,
     /// Material of the reduced elasticity. `None` with linear elasticity.
     pub material: Option<Material>,
-    /// Time in which the own shapes of the held patch were made, ms. `None` without such shapes:
-    /// with linear elasticity, and for a model without its simulation mesh.
+    /// Longest time in which the own shapes of the held patch were made, ms. They are made anew as
+    /// the hand goes on. `None` without such shapes: with linear elasticity, and for a model
+    /// without its simulation mesh.
     pub shapes_ms: Option<f64>,
     /// Whether the body came to rest: whether its speeds and the change of the force fell below a
     /// millionth of what they were.
@@ -112,19 +112,21 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
     }
     let patch = Patch::around(model.surface(), closest as u32, pull.radius)?;
     let grab = body.grab(&patch, GrabConfig::default())?;
-    let begun = Instant::now();
-    let shapes = if elasticity == Elasticity::Reduced {
-        HeldShapes::new(model, std::slice::from_ref(&patch))?.map(Arc::new)
-    } else {
-        None
+    let mut shapes_ms: Option<f64> = None;
+    let mut shape = |body: &mut Body| {
+        let begun = Instant::now();
+        if body.make_held_shapes()? {
+            let took = begun.elapsed().as_secs_f64() * 1e3;
+            shapes_ms = Some(shapes_ms.map_or(took, |most| most.max(took)));
+        }
+        Ok::<_, LabError>(())
     };
-    let shapes_ms = shapes.as_ref().map(|_| begun.elapsed().as_secs_f64() * 1e3);
-    body.set_held_shapes(shapes)?;
     let start = Vector3::from(body.grab_position(grab)?);
     let by = Vector3::from(pull.by);
 
     let mut times = Vec::new();
     let mut timed = |body: &mut Body, part: f64| {
+        shape(body)?;
         body.set_target(grab, (start + part * by).into())?;
         let begun = Instant::now();
         body.step()?;

@@ -47,7 +47,7 @@ struct Watch {
 impl World for Watch {
     fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
         let body = &mut self.scene.body;
-        if body.held_shapes().is_none() && body.held_patches().len() > 0 {
+        if body.held_shapes().is_none() && body.held_places().len() > 0 {
             body.set_held_shapes(self.shapes.clone()).unwrap();
         }
         self.scene.step(now, tick, host);
@@ -76,7 +76,7 @@ impl World for Watch {
         {
             self.columns.push((view.tick(), s.to_vec()));
         }
-        if self.guest_has_shapes && !own && !view.held_patches().is_empty() {
+        if self.guest_has_shapes && !own && !view.held_places().is_empty() {
             session.set_held_shapes(BODY, self.shapes.clone());
         }
     }

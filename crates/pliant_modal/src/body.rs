@@ -5,8 +5,8 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Contacts, Frame, FrameMotion, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel,
-    ObstacleShape, Patch, Precision, State, StepError, StepReport, StepSettings,
+    Contacts, Frame, FrameMotion, GrabConfig, Hand, HeldPatch, HeldPlace, HeldShapes, Hold, Kernel, Load,
+    ModalModel, ObstacleShape, Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
     step::group::{Parts, View},
 };
@@ -318,9 +318,42 @@ impl Body {
         self.kernel.held_shapes()
     }
 
-    /// Center vertices and radii (m) of the patches that are held, oldest first.
-    pub fn held_patches(&self) -> impl ExactSizeIterator<Item = (u32, f64)> + Clone + '_ {
-        self.hands.iter().map(|hand| hand.patch.center_and_radius())
+    /// The patches that are held and where they are, oldest first.
+    pub fn held_places(&self) -> impl ExactSizeIterator<Item = HeldPlace> + Clone + '_ {
+        self.hands.iter().map(|hand| {
+            let (vertex, radius) = hand.patch.center_and_radius();
+            HeldPlace { vertex, radius, way: self.way(&hand.patch).into() }
+        })
+    }
+
+    /// Mean displacement of a patch from rest, m, body axes.
+    fn way(&self, patch: &HeldPatch) -> Vector3<f64> {
+        let own = self.kernel.held_shapes().map(|shapes| shapes.displacement(patch, &self.state.s));
+        patch.displacement(&self.state.q, self.kernel.warps()) + own.unwrap_or_default()
+    }
+
+    /// Makes the own shapes of the held patches anew where those that the body has do not suffice
+    /// ([`HeldShapes::wanted`]). That takes up to a second: between frames it is done beside them.
+    /// Returns whether the body has got others.
+    ///
+    /// # Errors
+    /// Returns the errors of [`HeldShapes::of_places`].
+    pub fn make_held_shapes(&mut self) -> Result<bool, StepError> {
+        // A kernel of fewer coordinates does not use shapes.
+        let whole = self.mode_count() == self.model().mode_count();
+        if !whole || !self.config.settings.is_reduced(self.model()) {
+            return Ok(false);
+        }
+        let own = self.held_shapes().map(|shapes| &**shapes);
+        let Some(places) = HeldShapes::wanted(self.model(), self.held_places(), own) else {
+            return Ok(false);
+        };
+        let shapes = HeldShapes::of_places(self.model(), &places)?.map(Arc::new);
+        let changes = shapes.is_some() || self.held_shapes().is_some();
+        if changes {
+            self.set_held_shapes(shapes)?;
+        }
+        Ok(changes)
     }
 
     /// The grabs on the body, oldest first.
@@ -354,9 +387,7 @@ impl Body {
     /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         let patch = &self.hands[self.find(id)?].patch;
-        let own = self.kernel.held_shapes().map(|shapes| shapes.displacement(patch, &self.state.s));
-        let modal = patch.displacement(&self.state.q, self.kernel.warps());
-        let local = patch.rest() + modal + own.unwrap_or_default();
+        let local = patch.rest() + self.way(patch);
         Ok(self.state.frame.to_world(local).into())
     }
 

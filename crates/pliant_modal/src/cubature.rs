@@ -6,7 +6,7 @@
 //! Graph. 27(5), 2008). A bake makes the rule of a model, and taking hold of a patch the rule that
 //! includes the patch's own shapes.
 
-use nalgebra::{Matrix3, SMatrix, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, SMatrix, Vector3};
 
 use crate::{
     ElasticEnergy, Hyperelastic,
@@ -69,10 +69,11 @@ pub fn guided_shapes(
     ways: &[f64],
     most: f64,
 ) -> Vec<GuidedShape> {
+    let patches = std::slice::from_ref(patch);
     let mut q = vec![0.0; omega.len()];
     let mut out = Vec::new();
     for way in ways {
-        let Some(next) = hold(energy, omega, patch, &(*way * direction), &q, ROUNDS) else { break };
+        let Some(next) = hold(energy, omega, patches, &[*way * direction], &q, ROUNDS) else { break };
         let reached = energy.energy(&next.q);
         if reached.is_nan() || reached > most {
             break;
@@ -84,32 +85,34 @@ pub fn guided_shapes(
 }
 
 /// Number of Newton rounds that find a shape.
-const ROUNDS: usize = 5;
+pub(crate) const ROUNDS: usize = 5;
 
-/// A shape in which a patch is held.
+/// A shape in which patches are held.
 #[derive(Debug, Clone)]
 pub struct GuidedShape {
     /// Coordinates.
     pub q: Vec<f64>,
-    /// Displacement of the patch, m.
-    pub there: Vector3<f64>,
-    /// Force that holds the patch there, N.
-    pub force: Vector3<f64>,
+    /// Displacement of each held patch, m.
+    pub there: Vec<Vector3<f64>>,
+    /// Force that holds each of them there, N.
+    pub forces: Vec<Vector3<f64>>,
 }
 
-/// Returns roughly the shape of least energy in which a patch is displaced by `there` (m), from the
-/// shape `start`. Returns `None` if it is not finite.
+/// Returns roughly the shape of least energy in which patches are displaced by `there` (m), from
+/// the shape `start`. Returns `None` if it is not finite.
 pub(crate) fn hold(
     energy: &mut ElasticEnergy,
     omega: &[f64],
-    patch: &Rows,
-    there: &Vector3<f64>,
+    patches: &[Rows],
+    there: &[Vector3<f64>],
     start: &[f64],
     rounds: usize,
 ) -> Option<GuidedShape> {
-    let m = start.len();
+    let (m, rows) = (start.len(), 3 * patches.len());
+    let row = |k: usize| &patches[k / 3][k % 3][..];
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let mut q = start.to_vec();
-    let mut force = Vector3::zeros();
+    let mut forces = DVector::zeros(rows);
     let mut factor = Cholesky::new(m);
     for _ in 0..rounds {
         energy.linearize(&q);
@@ -119,18 +122,18 @@ pub(crate) fn hold(
         factor.factor();
         let mut free = energy.force().to_vec();
         factor.solve(&mut free);
-        let soft: [Vec<f64>; 3] = std::array::from_fn(|axis| {
-            let mut row = patch[axis].clone();
-            factor.solve(&mut row);
-            row
-        });
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let gap = there - Vector3::from_fn(|axis, _| dot(&patch[axis], &q) - dot(&patch[axis], &free));
-        let inner = Matrix3::from_fn(|a, b| dot(&patch[a], &soft[b]));
-        force = inner.try_inverse()? * gap;
+        let solved = |k: usize| {
+            let mut out = row(k).to_vec();
+            factor.solve(&mut out);
+            out
+        };
+        let soft: Vec<Vec<f64>> = (0..rows).map(solved).collect();
+        let gap = DVector::from_fn(rows, |k, _| there[k / 3][k % 3] - dot(row(k), &q) + dot(row(k), &free));
+        let inner = DMatrix::from_fn(rows, rows, |a, b| dot(row(a), &soft[b]));
+        forces = inner.lu().solve(&gap)?;
         let (mut way, mut length) = (0.0, 0.0);
         for (i, q) in q.iter_mut().enumerate() {
-            let step = force[0] * soft[0][i] + force[1] * soft[1][i] + force[2] * soft[2][i] - free[i];
+            let step = forces.iter().zip(&soft).map(|(force, soft)| force * soft[i]).sum::<f64>() - free[i];
             *q += step;
             way += (omega[i] * step).powi(2);
             length += (omega[i] * *q).powi(2);
@@ -139,7 +142,9 @@ pub(crate) fn hold(
             break;
         }
     }
-    q.iter().chain(force.iter()).all(|x| x.is_finite()).then_some(GuidedShape { q, there: *there, force })
+    let sound = q.iter().chain(forces.iter()).all(|x| x.is_finite());
+    let forces = forces.as_slice().as_chunks::<3>().0.iter().map(|&force| force.into()).collect();
+    sound.then_some(GuidedShape { q, there: there.to_vec(), forces })
 }
 
 /// What the weights of a rule are fitted to.

@@ -69,7 +69,7 @@ pub use contact::{
 };
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};
-pub use held::{HeldShapes, SimulationMesh, VertexPlace};
+pub use held::{HeldPlace, HeldShapes, SimulationMesh, VertexPlace};
 pub use integrator::{Coefficients, Integrator};
 pub use islands::{Islands, Together};
 pub use limit::streaming_sum;

@@ -6,8 +6,8 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Body, BodyConfig, Contact, GrabConfig, GrabId, HeldShapes, ModalModel, ModelHash, Patch, State,
-    StepError, StepSettings, Touched,
+    Body, BodyConfig, Contact, GrabConfig, GrabId, HeldPlace, HeldShapes, ModalModel, ModelHash, Patch,
+    State, StepError, StepSettings, Touched,
     contact::{Memory, Place},
     error::finite,
 };
@@ -25,7 +25,7 @@ pub struct SavedBody {
     step: f64,
     state: State,
     hands: Vec<SavedHand>,
-    shapes: Vec<(u32, f64)>,
+    shapes: Vec<HeldPlace>,
     contacts: SavedContacts,
 }
 
@@ -56,9 +56,8 @@ impl SavedBody {
         (&self.settings, self.step)
     }
 
-    /// Center vertices and radii (m) of the held patches whose own shapes the body had, in the
-    /// order of [`HeldShapes::patches`].
-    pub fn shapes(&self) -> &[(u32, f64)] {
+    /// The held patches whose own shapes the body had, as [`HeldShapes::places`] has them.
+    pub fn shapes(&self) -> &[HeldPlace] {
         &self.shapes
     }
 
@@ -99,7 +98,7 @@ impl Body {
             step: self.config().step,
             state: self.state().clone(),
             hands: hands.collect(),
-            shapes: self.held_shapes().map_or_else(Vec::new, |shapes| shapes.patches().collect()),
+            shapes: self.held_shapes().map_or_else(Vec::new, |shapes| shapes.places().collect()),
             contacts: SavedContacts {
                 friction: contacts.friction(),
                 theta: contacts.theta,

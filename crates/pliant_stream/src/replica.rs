@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 use pliant_modal::{
-    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, ImpliedPulls, Kernel, Load, ModalModel,
-    ObstacleShape, Patch, State, StepSettings,
+    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldPlace, HeldShapes, Hold, ImpliedPulls, Kernel, Load,
+    ModalModel, ObstacleShape, Patch, State, StepSettings,
 };
 
 use crate::prediction::{BodyCopy, HandState};
@@ -312,6 +312,17 @@ impl Replica {
         }
         self.kernel.equilibrate_columns(state, &self.hands);
         self.release_all();
+    }
+
+    /// The patches of the shapes that hands hold, and where they are in a state.
+    pub(crate) fn held_places(&mut self, state: &State) -> Vec<HeldPlace> {
+        let Some(shapes) = self.kernel.held_shapes().cloned() else { return Vec::new() };
+        let place = |HeldPlace { vertex, radius, .. }| {
+            let modal = self.patch(vertex, radius)?.displacement(&state.q, self.kernel.warps());
+            let own = Vector3::from(shapes.mean(vertex, radius, &state.s).unwrap_or_default());
+            Some(HeldPlace { vertex, radius, way: (modal + own).into() })
+        };
+        shapes.places().filter_map(place).collect()
     }
 
     /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].

@@ -76,7 +76,7 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
     // The surface that is shown is the body's own.
     let visual = app.world().get::<VisualState>(body).unwrap();
     let (shapes, s) = visual.held().unwrap();
-    assert!(shapes.patches().len() == 1 && s.iter().any(|s| *s != 0.0));
+    assert!(shapes.places().len() == 1 && s.iter().any(|s| *s != 0.0));
     let positions = state(&app, body).positions(visual);
     let mut solver = state(&app, body).body().clone();
     let mut want = positions.clone();

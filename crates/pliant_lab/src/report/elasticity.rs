@@ -4,9 +4,7 @@ use std::{fmt::Write, sync::Arc};
 
 use pliant_bake::{BakeConfig, Deflection, Material, PrescribedPatch, StaticLoads, deflect};
 use pliant_mesh::{TetMesh, shapes};
-use pliant_modal::{
-    Body, BodyConfig, Elasticity, Element, GrabConfig, HeldShapes, ModalModel, Patch, StepSettings,
-};
+use pliant_modal::{Body, BodyConfig, Elasticity, Element, GrabConfig, ModalModel, Patch, StepSettings};
 
 use super::{
     physics::figure,
@@ -40,7 +38,7 @@ const LINES: [&str; 3] = ["linear", "reduced", "reduced, with the patch's own sh
 fn led(
     model: &Arc<ModalModel>,
     elasticity: Elasticity,
-    shapes: Option<Arc<HeldShapes>>,
+    has_shapes: bool,
     patch: &Patch,
     way: [f64; 3],
     truth: &Deflection,
@@ -48,9 +46,11 @@ fn led(
     let settings = StepSettings { elasticity, damping_scale: 10.0, ..StepSettings::default() };
     let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / RATE, ..settings.into() })?;
     let grab = body.grab(patch, GrabConfig::default())?;
-    body.set_held_shapes(shapes)?;
     let start = body.grab_position(grab)?;
     for i in 0..1_800 {
+        if has_shapes {
+            body.make_held_shapes()?;
+        }
         let s = crate::smooth(f64::from(i) / 600.0);
         body.set_target(grab, std::array::from_fn(|k| start[k] + s * way[k]))?;
         body.step()?;
@@ -80,8 +80,7 @@ fn setting(
     let elasticity = if line == 0 { Elasticity::Linear } else { Elasticity::Reduced };
     let (mut errors, mut cost) = (Vec::new(), [0.0f64; 2]);
     for (patch, way, truth) in hands {
-        let shapes = if line == 2 { HeldShapes::new(&model, std::slice::from_ref(patch))? } else { None };
-        let (mut body, error) = led(&model, elasticity, shapes.map(Arc::new), patch, *way, truth)?;
+        let (mut body, error) = led(&model, elasticity, line == 2, patch, *way, truth)?;
         errors.push(error);
         let step = time_us(1_000, || Ok(body.step().map(|_| ())?))?;
         let mut positions = model.surface().positions().to_vec();

@@ -17,34 +17,32 @@ const LEAST: f64 = 1e-6;
 /// Combinations of columns of which the coordinates have all but this share of the energy end.
 const NEW: f64 = 1e-3;
 
-/// Most columns that correct those of second order: of one patch, and of all patches together.
-/// Every column makes the step longer.
-const MAX_CORRECTIONS: [usize; 2] = [9, 12];
-
 /// Corrections whose energy is a smaller share than this of that of the shapes end.
 const CORRECTION: f64 = 1e-8;
-
-/// Largest energy density of a training shape, as a share of Young's modulus.
-const ENERGY: f64 = 0.02;
-
-/// Ways of a hand in training shapes, as shares of the body's size.
-const WAYS: [f64; 5] = [0.04, 0.08, 0.16, 0.3, 0.5];
-
-/// Ways of shapes that are not corrected begin here.
-const FAR: f64 = 0.4;
-
-/// Number of points, outside and inside the region, that find the shapes that are corrected.
-const POINTS: [usize; 2] = [200, 400];
-
-/// Number of points, outside and inside the region, that find the same shapes with the columns that
-/// correct them.
-const COARSE: [usize; 2] = [150, 300];
 
 /// Number of Newton rounds that find a shape anew with more columns.
 const AGAIN: usize = 2;
 
-/// Number of points outside of which those are taken.
-const OUTSIDE: usize = 2_000;
+/// Shares of the ways of hands at which shapes are found.
+const SHARES: [f64; 4] = [0.35, 0.7, 1.0, 1.25];
+
+/// How far beside the end of its way a hand is in further shapes, as a share of the longest way and
+/// at least as a share of the body's size.
+const BESIDE: [f64; 2] = [0.25, 0.04];
+
+/// Number of times that shapes on the ways of hands are corrected, and the number of columns that
+/// each time adds.
+const CORRECTIONS: (usize, usize) = (3, 6);
+
+/// Number of points outside of the region that find shapes on the ways of hands. Inside, all points
+/// do: with half of them, the shapes bend where no point is, and pressing hands are off by 50 %.
+const OUTSIDE: usize = 400;
+
+/// Number of columns that are kept beside the static ones: of one patch, and of each further one.
+const KEPT: [usize; 2] = [6, 2];
+
+/// Number of points from which those are taken.
+const OUTSIDE_ALL: usize = 2_000;
 
 /// The six directions in which hands go in training shapes.
 const DIRECTIONS: [Vector3<f64>; 6] = [
@@ -56,7 +54,17 @@ const DIRECTIONS: [Vector3<f64>; 6] = [
     Vector3::new(0.0, 0.0, -1.0),
 ];
 
+/// Shapes with `more` zeros after the first `width` entries.
+fn widened(shapes: &[GuidedShape], width: usize, more: usize) -> Vec<GuidedShape> {
+    let mut out = shapes.to_vec();
+    for shape in &mut out {
+        shape.q.splice(width..width, std::iter::repeat_n(0.0, more));
+    }
+    out
+}
+
 /// Columns on a region.
+#[derive(Clone)]
 pub(super) struct Columns {
     /// Displacements `X`, `[node][axis][column]`.
     pub(super) values: Vec<f64>,
@@ -101,90 +109,156 @@ impl Columns {
         bare.beside(model, region, &energies, NEW, usize::MAX, None)
     }
 
-    /// Adds columns that correct shapes in which the hands pull far: the displacements by which a
-    /// Newton step changes them, less what the columns and the coordinates have of them. The
-    /// corrections with the largest shares of the energy are kept. Returns the columns and the
-    /// shapes, each with the index of its patch.
+    /// Columns for hands that have led their patches by `ways` (m): shapes on the way there and
+    /// around its end are corrected again and again. Of all columns, those that these shapes use
+    /// most are kept. Returns the columns and the shapes.
     pub(super) fn corrected(
         self,
         model: &ModalModel,
         region: &Region<'_>,
         loads: &[NodeLoad],
         law: Hyperelastic,
-    ) -> Option<(Self, Vec<(usize, GuidedShape)>)> {
-        let outside = thinned(&region.outside(model.size(), OUTSIDE), POINTS[0]);
-        let places = [outside, thinned(&region.inside(), POINTS[1])].concat();
-        let points = region.points(&places, &self, &region.node_rows(&self));
-        let patches = self.rows(region, loads);
-        let omega = self.omega(model);
-        let guided = guided(model, law, &omega, &points, &patches)?;
-        let mut blocks = Vec::new();
-        for (index, load) in loads.iter().enumerate() {
-            let own: Vec<&GuidedShape> =
-                guided.iter().filter(|(patch, _)| *patch == index).map(|(_, shape)| shape).collect();
-            let near = |shape: &&GuidedShape| shape.there.norm() < FAR * model.size();
-            let own: Vec<&GuidedShape> = own.into_iter().filter(near).collect();
-            let cases = own.len();
-            if cases == 0 {
-                continue;
-            }
-            let mut found = region.corrections(index, load, &own, &self, law);
-            // What matters is the share of a shape's energy that is corrected.
-            let scales: Vec<f64> = own
-                .iter()
-                .map(|shape| shape.q.iter().zip(&omega).map(|(q, omega)| (q * omega).powi(2)).sum::<f64>())
-                .map(|energy| if energy > 0.0 { 1.0 / energy.sqrt() } else { 0.0 })
-                .collect();
-            for row in found.chunks_exact_mut(cases) {
-                row.iter_mut().zip(&scales).for_each(|(x, scale)| *x *= scale);
-            }
-            blocks.push((found, cases));
+        ways: &[Vector3<f64>],
+    ) -> Option<(Self, Vec<GuidedShape>)> {
+        let mut columns = self;
+        let points_of = [OUTSIDE, usize::MAX];
+        let points = columns.some_points(model, region, points_of);
+        let mut shapes = led(model, law, &columns.omega(model), &points, &columns.rows(region, loads), ways)?;
+        let (times, more) = CORRECTIONS;
+        for _ in 0..times {
+            let Some(new) = columns.corrections(model, region, loads, law, &shapes, more) else { break };
+            shapes = widened(&shapes, columns.width, new.width);
+            columns = columns.with(&new);
+            let points = columns.some_points(model, region, points_of);
+            shapes = columns.again(model, region, loads, law, &points, shapes)?;
         }
-        let width = blocks.iter().map(|(_, cases)| cases).sum();
+        let keep = KEPT[0] + KEPT[1] * (loads.len() - 1);
+        let (columns, shapes) =
+            columns.compressed(&columns.rows(region, loads), model.omega(), shapes, keep)?;
+        let points = columns.some_points(model, region, points_of);
+        let shapes = columns.again(model, region, loads, law, &points, shapes)?;
+        (!shapes.is_empty()).then_some((columns, shapes))
+    }
+
+    /// Keeps the static shapes of the patches and `keep` further combinations of columns that
+    /// given shapes use most.
+    fn compressed(
+        &self,
+        rows: &[Rows],
+        omega: &[f64],
+        shapes: Vec<GuidedShape>,
+        keep: usize,
+    ) -> Option<(Self, Vec<GuidedShape>)> {
+        let width = self.width;
+        // The columns have energy one each and none together: the static shape of a force is that
+        // of its work on each column.
+        let statics = DMatrix::from_fn(width, 3 * rows.len(), |i, k| rows[k / 3][k % 3][i]);
+        let energy = |q: &[f64]| {
+            let modal = q[width..].iter().zip(omega).map(|(q, omega)| (q * omega).powi(2)).sum::<f64>();
+            modal + q[..width].iter().map(|s| s * s).sum::<f64>()
+        };
+        let used = DMatrix::from_fn(width, shapes.len(), |i, k| {
+            let q = &shapes[k].q;
+            q[i] / energy(q).max(f64::MIN_POSITIVE).sqrt()
+        });
+        let statics = orthonormal_basis(statics, 3 * rows.len(), 1e-6)?;
+        let rest = &used - &statics * (statics.transpose() * &used);
+        let combine = match orthonormal_basis(rest, keep, 1e-6) {
+            Some(more) => {
+                let columns: Vec<_> =
+                    statics.column_iter().chain(more.column_iter()).map(|c| c.into_owned()).collect();
+                DMatrix::from_columns(&columns)
+            }
+            None => statics,
+        };
+        let out = Self {
+            values: combined(&self.values, &combine),
+            parts: combined(&self.parts, &combine),
+            width: combine.ncols(),
+        };
+        let shapes = shapes.into_iter().map(|mut shape| {
+            let s = DMatrix::from_row_slice(1, width, &shape.q[..width]) * &combine;
+            shape.q.splice(..width, s.iter().copied());
+            shape
+        });
+        let shapes = shapes.collect();
+        Some((out, shapes))
+    }
+
+    /// Points of about so many elements outside and inside of the region.
+    fn some_points(
+        &self,
+        model: &ModalModel,
+        region: &Region<'_>,
+        [outside, inside]: [usize; 2],
+    ) -> Vec<Point> {
+        let all = region.outside(model.size(), OUTSIDE_ALL);
+        let places = [thinned(&all, outside), thinned(&region.inside(), inside)].concat();
+        region.points(&places, self, &region.node_rows(self))
+    }
+
+    /// Finds shapes anew, from where they were.
+    fn again(
+        &self,
+        model: &ModalModel,
+        region: &Region<'_>,
+        loads: &[NodeLoad],
+        law: Hyperelastic,
+        points: &[Point],
+        shapes: Vec<GuidedShape>,
+    ) -> Option<Vec<GuidedShape>> {
+        let (omega, patches) = (self.omega(model), self.rows(region, loads));
+        let mut energy = coarse(model, law, &omega, points)?;
+        let again =
+            |shape: GuidedShape| cubature::hold(&mut energy, &omega, &patches, &shape.there, &shape.q, AGAIN);
+        Some(shapes.into_iter().filter_map(again).collect())
+    }
+
+    /// Makes columns that correct shapes: the displacements by which a Newton step changes them,
+    /// less what the columns and the coordinates have of them. The `most` with the largest shares
+    /// of the energy are kept. Returns `None` if there are none.
+    fn corrections(
+        &self,
+        model: &ModalModel,
+        region: &Region<'_>,
+        loads: &[NodeLoad],
+        law: Hyperelastic,
+        shapes: &[GuidedShape],
+        most: usize,
+    ) -> Option<Self> {
+        let (omega, width) = (self.omega(model), shapes.len());
         if width == 0 {
-            return Some((self, guided));
+            return None;
         }
-        let mut values: Vec<f64> = Vec::with_capacity(3 * region.node_count() * width);
-        for row in 0..3 * region.node_count() {
-            for (block, cases) in &blocks {
-                values.extend(&block[row * cases..][..*cases]);
-            }
+        let mut values = region.corrections(loads, shapes, self, law);
+        // What matters is the share of a shape's energy that is corrected.
+        let scales: Vec<f64> = shapes
+            .iter()
+            .map(|shape| shape.q.iter().zip(&omega).map(|(q, omega)| (q * omega).powi(2)).sum::<f64>())
+            .map(|energy| if energy > 0.0 { 1.0 / energy.sqrt() } else { 0.0 })
+            .collect();
+        for row in values.chunks_exact_mut(width) {
+            row.iter_mut().zip(&scales).for_each(|(x, scale)| *x *= scale);
         }
         if !values.iter().all(|x| x.is_finite()) {
-            return Some((self, guided));
+            return None;
         }
-        let most = if loads.len() == 1 { MAX_CORRECTIONS[0] } else { MAX_CORRECTIONS[1] };
         let energies = region.energies([&values, &values], [width; 2]);
         let corrections = Self { values, width, parts: Vec::new() };
-        let Some(new) = corrections.beside(model, region, &energies, CORRECTION, most, Some(&self)) else {
-            return Some((self, guided));
-        };
+        corrections.beside(model, region, &energies, CORRECTION, most, Some(self))
+    }
+
+    /// These columns and more.
+    fn with(&self, new: &Self) -> Self {
         let joined = |a: &[f64], b: &[f64]| -> Vec<f64> {
             let rows = a.chunks_exact(self.width).zip(b.chunks_exact(new.width));
             rows.flat_map(|(a, b)| a.iter().chain(b).copied()).collect()
         };
-        let all = Self {
+        Self {
             values: joined(&self.values, &new.values),
             parts: joined(&self.parts, &new.parts),
             width: self.width + new.width,
-        };
-        let mut guided = guided;
-        for (_, shape) in &mut guided {
-            shape.q.splice(self.width..self.width, std::iter::repeat_n(0.0, new.width));
         }
-        let (inside, outside) = (region.inside(), region.outside(model.size(), OUTSIDE));
-        let places = [thinned(&outside, COARSE[0]), thinned(&inside, COARSE[1])].concat();
-        let points = region.points(&places, &all, &region.node_rows(&all));
-        let (omega, patches) = (all.omega(model), all.rows(region, loads));
-        let (mut energy, most) = coarse(model, law, &omega, &points)?;
-        let again = |(patch, shape): (usize, GuidedShape)| {
-            let found =
-                cubature::hold(&mut energy, &omega, patches.get(patch)?, &shape.there, &shape.q, AGAIN)?;
-            let reached = energy.energy(&found.q);
-            (reached <= most).then_some((patch, found))
-        };
-        let found = guided.into_iter().filter_map(again).collect();
-        Some((all, found))
     }
 
     /// Takes the part of the coordinates, and of `others`, out of columns with given energies.
@@ -265,43 +339,72 @@ impl Columns {
     }
 }
 
-/// The energy of some points, and the most that a training shape may have of it, J.
-fn coarse(
-    model: &ModalModel,
-    law: Hyperelastic,
-    omega: &[f64],
-    points: &[Point],
-) -> Option<(ElasticEnergy, f64)> {
+/// The energy of some points.
+fn coarse(model: &ModalModel, law: Hyperelastic, omega: &[f64], points: &[Point]) -> Option<ElasticEnergy> {
     let few = ReducedElasticity {
         material: model.material()?,
         weights: points.iter().map(|point| point.weight).collect(),
         gradients: points.iter().flat_map(|point| point.gradients.iter().map(|&x| x as f32)).collect(),
         mesh: None,
     };
-    let energy = ElasticEnergy::new(&few, law, omega).ok()?;
-    let most = ENERGY * model.info().young * energy.volume();
-    Some((energy, most))
+    ElasticEnergy::new(&few, law, omega).ok()
 }
 
-/// Finds the shapes in which each patch is led along the axes, with the energy of some points.
-/// Returns them with the indices of their patches.
-fn guided(
+/// Finds the shapes in which all patches are led by shares of `ways` (m), and those in which one of
+/// them is a little beside the end of its way.
+fn led(
     model: &ModalModel,
     law: Hyperelastic,
     omega: &[f64],
     points: &[Point],
     patches: &[Rows],
-) -> Option<Vec<(usize, GuidedShape)>> {
-    let (mut energy, most) = coarse(model, law, omega, points)?;
-    let ways = WAYS.map(|way| way * model.size());
-    let mut out = Vec::new();
-    for (index, patch) in patches.iter().enumerate() {
+    ways: &[Vector3<f64>],
+) -> Option<Vec<GuidedShape>> {
+    let mut energy = coarse(model, law, omega, points)?;
+    let mut out: Vec<GuidedShape> = Vec::new();
+    let mut q = vec![0.0; omega.len()];
+    let mut end = q.clone();
+    let far = ways.iter().map(|way| way.norm()).fold(0.0, f64::max);
+    for share in SHARES.into_iter().filter(|_| far > 0.0) {
+        let there: Vec<Vector3<f64>> = ways.iter().map(|way| share * way).collect();
+        let Some(shape) = cubature::hold(&mut energy, omega, patches, &there, &q, cubature::ROUNDS) else {
+            break;
+        };
+        q.clone_from(&shape.q);
+        if share <= 1.0 {
+            end.clone_from(&shape.q);
+        }
+        out.push(shape);
+    }
+    let beside = (BESIDE[0] * far).max(BESIDE[1] * model.size());
+    for index in 0..patches.len() {
         for direction in &DIRECTIONS {
-            let led = cubature::guided_shapes(&mut energy, omega, patch, direction, &ways, most);
-            out.extend(led.into_iter().map(|shape| (index, shape)));
+            let mut there = ways.to_vec();
+            there[index] += beside * direction;
+            if let Some(shape) = cubature::hold(&mut energy, omega, patches, &there, &end, cubature::ROUNDS) {
+                out.push(shape);
+            }
         }
     }
     Some(out)
+}
+
+/// Orthonormal columns that span a matrix: at most `most`, and none whose singular value is below
+/// `least` of the largest. Returns `None` for a matrix of zeros.
+fn orthonormal_basis(matrix: DMatrix<f64>, most: usize, least: f64) -> Option<DMatrix<f64>> {
+    let gram = &matrix * matrix.transpose();
+    if !gram.iter().all(|x| x.is_finite()) {
+        return None;
+    }
+    let eigen = gram.symmetric_eigen();
+    let top = eigen.eigenvalues.max();
+    let mut order: Vec<usize> = (0..eigen.eigenvalues.len())
+        .filter(|&k| eigen.eigenvalues[k] > least * least * top && top > 0.0)
+        .collect();
+    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
+    order.truncate(most);
+    let columns: Vec<_> = order.iter().map(|&k| eigen.eigenvectors.column(k).into_owned()).collect();
+    (!columns.is_empty()).then(|| DMatrix::from_columns(&columns))
 }
 
 /// The combinations of columns that have energy one each and none together, given the energies of

@@ -16,9 +16,10 @@
 //! use of attachment modes in substructure coupling for dynamic analysis*, 1977). Together with the
 //! coordinates they get a cubature rule of their own.
 //!
-//! Where a hand pulls far, shapes of second order are not enough. Further columns are the
-//! corrections that a Newton step of the full elements makes to shapes in which the hands pull far
-//! along the axes.
+//! Where a hand pulls far, shapes of second order are not enough. The body is therefore led to where
+//! the hands are, and the residual forces of the full elements there, under the stiffness at rest,
+//! are further columns, again and again: the columns follow the hands. Those that the shapes on the
+//! way use most are kept. When a hand has gone on, the columns are made anew.
 //!
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 
@@ -31,6 +32,7 @@ mod stiffness;
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 pub use mesh::{SimulationMesh, VertexPlace};
 
@@ -42,7 +44,7 @@ use crate::{
     HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, StepError,
     cubature::{self, Fit, GuidedShape, Point},
     nonlinear::Gradients,
-    step::{contact_floor, residual},
+    step::contact_floor,
 };
 
 /// Number of points outside of the region to choose from.
@@ -69,6 +71,29 @@ pub(crate) fn key(patch: &Patch) -> PatchKey {
     (patch.center(), patch.radius().to_bits())
 }
 
+/// A patch that a hand holds, and where the hand has led it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct HeldPlace {
+    /// Center vertex of the patch.
+    pub vertex: u32,
+    /// Radius of the patch, m.
+    pub radius: f64,
+    /// Mean displacement of the patch from rest, m, body axes.
+    pub way: [f64; 3],
+}
+
+impl HeldPlace {
+    /// What identifies the patch.
+    fn key(&self) -> PatchKey {
+        (self.vertex, self.radius.to_bits())
+    }
+}
+
+/// Hands that are farther from where shapes were made than this share of the body's size, and than
+/// this share of the longest way besides, need others.
+const NEAR: f64 = 0.02;
+const NEAR_SHARE: f64 = 0.25;
+
 /// The own shapes of the patches that hands hold on a body with reduced elasticity.
 ///
 /// They are made once, which takes about half a second, and shared by all copies of the body.
@@ -76,10 +101,12 @@ pub(crate) fn key(patch: &Patch) -> PatchKey {
 pub struct HeldShapes {
     model: ModelHash,
     keys: Vec<PatchKey>,
+    /// Where hands have led the patches, m, body axes.
+    ways: Vec<Vector3<f64>>,
     /// Mean displacement of each patch by the columns, `[axis][column]`, m.
     rows: Vec<cubature::Rows>,
-    /// What is left of the residual flexibility of each patch at the baked stiffness, m/N.
-    residuals: Vec<Matrix3<f64>>,
+    /// Least compliance of each patch at the baked stiffness, m/N.
+    floors: Vec<f64>,
     columns: usize,
     /// The coordinates' part `P` that is taken out of each column, `[coordinate][column]`.
     parts: Vec<f64>,
@@ -96,7 +123,7 @@ impl HeldShapes {
     /// a step too long.
     pub const MAX_PATCHES: usize = 4;
 
-    /// Makes the shapes of patches of a model. The result is the same on every machine.
+    /// Makes the shapes of patches that are at rest. The result is the same on every machine.
     ///
     /// Returns `None` for a model without reduced elasticity or without its simulation mesh, for no
     /// patch and for more than four, for patches that nothing moves, and for a free body that is no
@@ -105,6 +132,67 @@ impl HeldShapes {
     /// # Errors
     /// Returns [`StepError::Vertex`] if a patch belongs to another surface.
     pub fn new(model: &ModalModel, patches: &[Patch]) -> Result<Option<Self>, StepError> {
+        Self::of_patches(model, patches, &vec![Vector3::zeros(); patches.len()])
+    }
+
+    /// Makes the shapes that patches need where hands have led them. See [`HeldShapes::new`].
+    ///
+    /// # Errors
+    /// Returns [`StepError::Vertex`] if the model has no such patch.
+    pub fn of_places(model: &ModalModel, places: &[HeldPlace]) -> Result<Option<Self>, StepError> {
+        let count = model.surface().positions().len();
+        let patch = |place: &HeldPlace| {
+            let vertex = place.vertex;
+            Patch::around(model.surface(), vertex, place.radius)
+                .map_err(|_| StepError::Vertex { vertex, count })
+        };
+        let patches = places.iter().map(patch).collect::<Result<Vec<_>, _>>()?;
+        let ways: Vec<Vector3<f64>> = places.iter().map(|place| place.way.into()).collect();
+        Self::of_patches(model, &patches, &ways)
+    }
+
+    /// Returns the places that a body needs shapes for, where those that it has do not suffice:
+    /// they are of other patches, or hands have gone farther than a fiftieth of the size and a
+    /// quarter of their way since. No places: the body needs no shapes any more.
+    ///
+    /// At most [`HeldShapes::MAX_PATCHES`] of the places get shapes. They are in a fixed order, and
+    /// their ways are rounded, so that equal and nearby ones share their shapes.
+    pub fn wanted(
+        model: &ModalModel,
+        held: impl IntoIterator<Item = HeldPlace>,
+        own: Option<&Self>,
+    ) -> Option<Vec<HeldPlace>> {
+        let mut places: Vec<HeldPlace> = held.into_iter().take(Self::MAX_PATCHES).collect();
+        places.sort_unstable_by_key(HeldPlace::key);
+        places.dedup_by_key(|place| place.key());
+        for way in places.iter_mut().map(|place| &mut place.way) {
+            if !way.iter().all(|x| x.is_finite()) {
+                *way = [0.0; 3];
+            }
+        }
+        let size = model.size();
+        let serves = |own: &Self| {
+            let farthest = own.ways.iter().map(|way| way.norm()).fold(0.0, f64::max);
+            let near = |(place, way): (&HeldPlace, &Vector3<f64>)| {
+                (Vector3::from(place.way) - way).norm() <= NEAR * size + NEAR_SHARE * farthest
+            };
+            places.iter().map(HeldPlace::key).eq(own.keys.iter().copied())
+                && places.iter().zip(&own.ways).all(near)
+        };
+        if own.map_or(places.is_empty(), serves) {
+            return None;
+        }
+        for place in &mut places {
+            place.way = place.way.map(|x| (x / (NEAR * size)).round() * NEAR * size);
+        }
+        Some(places)
+    }
+
+    fn of_patches(
+        model: &ModalModel,
+        patches: &[Patch],
+        ways: &[Vector3<f64>],
+    ) -> Result<Option<Self>, StepError> {
         let count = model.surface().positions().len();
         for patch in patches {
             if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
@@ -129,7 +217,7 @@ impl HeldShapes {
         }
         let loads: Vec<NodeLoad> = patches.iter().map(|patch| region.load(patch)).collect();
         let columns = Columns::new(model, &region, &loads, law)
-            .and_then(|columns| columns.corrected(model, &region, &loads, law));
+            .and_then(|columns| columns.corrected(model, &region, &loads, law, ways));
         let Some((columns, shapes)) = columns else { return Ok(None) };
         let width = columns.width;
         let whole = columns.rows(&region, &loads);
@@ -138,8 +226,7 @@ impl HeldShapes {
         }
         let own = |rows: &cubature::Rows| rows.each_ref().map(|row| row[..width].to_vec());
         let rows: Vec<cubature::Rows> = whole.iter().map(own).collect();
-        let residuals = patches.iter().zip(&rows).map(|(patch, own)| left_over(model, patch, own));
-        let residuals = residuals.collect::<Result<Vec<_>, _>>()?;
+        let floors = patches.iter().map(|patch| contact_floor(model, patch)).collect();
         let Some(rule) = rule(model, &region, law, &columns, &shapes) else { return Ok(None) };
         let omega = columns.omega(model);
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
@@ -158,8 +245,9 @@ impl HeldShapes {
         Ok(Some(Self {
             model: model_hash,
             keys,
+            ways: ways.to_vec(),
             rows,
-            residuals,
+            floors,
             columns: width,
             parts: columns.parts,
             gradients,
@@ -184,9 +272,13 @@ impl HeldShapes {
         self.weights.len()
     }
 
-    /// Center vertices and radii (m) of the patches.
-    pub fn patches(&self) -> impl ExactSizeIterator<Item = (u32, f64)> + '_ {
-        self.keys.iter().map(|&(vertex, radius)| (vertex, f64::from_bits(radius)))
+    /// The patches, and where the hands had led them when the shapes were made.
+    pub fn places(&self) -> impl ExactSizeIterator<Item = HeldPlace> + '_ {
+        self.keys.iter().zip(&self.ways).map(|(&(vertex, radius), &way)| HeldPlace {
+            vertex,
+            radius: f64::from_bits(radius),
+            way: way.into(),
+        })
     }
 
     /// Mean displacement of a patch by the columns at `s`, m, body axes, besides that by the
@@ -217,9 +309,10 @@ impl HeldShapes {
         self.mean(vertex, radius, s).unwrap_or_default().into()
     }
 
-    /// What is left of the residual flexibility of a patch at the baked stiffness, m/N.
+    /// What is left of the residual flexibility of a patch at the baked stiffness, m/N: next to
+    /// nothing, because the columns were corrected where the hands are.
     pub(crate) fn residual(&self, patch: &HeldPatch) -> Option<Matrix3<f64>> {
-        self.residuals.get(self.find(patch)?).copied()
+        Some(Matrix3::identity() * *self.floors.get(self.find(patch)?)?)
     }
 
     /// Takes the coordinates' part out of coordinates that draw a surface: `q - P s`. The columns'
@@ -267,30 +360,18 @@ impl HeldShapes {
     }
 }
 
-/// What is left of a patch's residual flexibility beside the columns, m/N: the static compliance
-/// minus that of coordinates and columns together, where it is positive.
-fn left_over(model: &ModalModel, patch: &Patch, own: &cubature::Rows) -> Result<Matrix3<f64>, StepError> {
-    let floor = contact_floor(model, patch);
-    let whole = residual(model, patch, model.mode_count())? - Matrix3::identity() * floor;
-    let left =
-        Matrix3::from_fn(|i, j| whole[(i, j)] - own[i].iter().zip(&own[j]).map(|(a, b)| a * b).sum::<f64>());
-    let eigen = (0.5 * (left + left.transpose())).symmetric_eigen();
-    let kept = Matrix3::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0) + floor));
-    Ok(eigen.eigenvectors * kept * eigen.eigenvectors.transpose())
-}
-
 /// Makes the rule of columns and coordinates, from training shapes. Returns `None` without any.
 fn rule(
     model: &ModalModel,
     region: &Region<'_>,
     law: Hyperelastic,
     columns: &Columns,
-    shapes: &[(usize, GuidedShape)],
+    shapes: &[GuidedShape],
 ) -> Option<Vec<Point>> {
     let omega = columns.omega(model);
     let m = omega.len();
     let outside = region.outside(model.size(), REFERENCE);
-    let shapes: Vec<Vec<f64>> = shapes.iter().map(|(_, shape)| shape.q.clone()).collect();
+    let shapes: Vec<Vec<f64>> = shapes.iter().map(|shape| shape.q.clone()).collect();
     let forces = region.forces(columns, &shapes, law, &outside);
     // Columns and coordinates are orthogonal to each other in the stiffness at rest.
     let mut stiffness = vec![0.0; m * m];

@@ -56,6 +56,8 @@ pub(super) struct Region<'a> {
     connectivity: Vec<u32>,
     /// For each patch: whether the patch's shapes may move a node of the region.
     free: Vec<Vec<bool>>,
+    /// Whether the corrections of shapes may move a node of the region.
+    free_for_any: Vec<bool>,
     stiffness: Stiffness,
 }
 
@@ -124,22 +126,22 @@ impl<'a> Region<'a> {
             }
         }
         let anchored: Vec<bool> = numbers.iter().map(|&n| mesh.is_anchored(n)).collect();
-        let free = around
-            .iter()
-            .map(|around| {
-                let mut own = vec![0u32; numbers.len()];
-                for &e in around {
-                    of(e).iter().for_each(|&node| own[local(node) as usize] += 1);
-                }
-                own.iter()
-                    .zip(&uses)
-                    .zip(&anchored)
-                    .map(|((own, all), anchored)| own == all && !anchored)
-                    .collect()
-            })
-            .collect();
+        let inner = |elements: &[u32]| -> Vec<bool> {
+            let mut own = vec![0u32; numbers.len()];
+            for &e in elements {
+                of(e).iter().for_each(|&node| own[local(node) as usize] += 1);
+            }
+            let nodes = own.iter().zip(&uses).zip(&anchored);
+            nodes.map(|((own, all), anchored)| own == all && !anchored).collect()
+        };
+        let free: Vec<Vec<bool>> = around.iter().map(|around| inner(around)).collect();
+        // Something must hold the shapes of a free body.
+        let mut free_for_any = inner(&elements);
+        if let (true, Some(first)) = (free_for_any.iter().all(|free| *free), free.first()) {
+            free_for_any.clone_from(first);
+        }
         let stiffness = Stiffness::new(kind, law, numbers.len(), &nodes, &affine);
-        Self { mesh, kind, elements, nodes, affine, numbers, connectivity, free, stiffness }
+        Self { mesh, kind, elements, nodes, affine, numbers, connectivity, free, free_for_any, stiffness }
     }
 
     /// Whether every patch's shapes are held somewhere: at an anchor or where the region ends.
@@ -227,7 +229,7 @@ impl<'a> Region<'a> {
         let mut moved = false;
         self.vertex(vertex, &mut |node, share| {
             let Ok(at) = self.numbers.binary_search(&node) else { return };
-            if !self.free.iter().any(|free| free[at]) {
+            if !self.free_for_any[at] {
                 return;
             }
             if !moved {
@@ -268,13 +270,12 @@ impl<'a> Region<'a> {
     }
 
     /// Displacements by which a Newton step with the stiffness at rest corrects shapes in which the
-    /// patch with this index is held. The shapes are those of columns and coordinates; the result
-    /// is `[node][axis][shape]`.
+    /// patches are held. The shapes are those of columns and coordinates; the result is
+    /// `[node][axis][shape]`.
     pub(super) fn corrections(
         &self,
-        index: usize,
-        load: &NodeLoad,
-        shapes: &[&GuidedShape],
+        loads: &[NodeLoad],
+        shapes: &[GuidedShape],
         columns: &Columns,
         law: Hyperelastic,
     ) -> Vec<f64> {
@@ -302,15 +303,17 @@ impl<'a> Region<'a> {
                 out: &mut forces,
             });
             forces.iter_mut().flatten().for_each(|lane| *lane = -*lane);
-            for &(node, share) in load {
-                let Ok(at) = self.numbers.binary_search(&node) else { continue };
-                for (axis, out) in forces[at].iter_mut().enumerate() {
-                    for (out, shape) in out.0.iter_mut().zip(shapes_of) {
-                        *out += share * shape.force[axis];
+            for (lane, shape) in shapes_of.iter().enumerate() {
+                for (load, force) in loads.iter().zip(&shape.forces) {
+                    for &(node, share) in load {
+                        let Ok(at) = self.numbers.binary_search(&node) else { continue };
+                        for (axis, out) in forces[at].iter_mut().enumerate() {
+                            out.0[lane] += share * force[axis];
+                        }
                     }
                 }
             }
-            self.stiffness.solve(&self.free[index], &mut forces, CORRECTED);
+            self.stiffness.solve(&self.free_for_any, &mut forces, CORRECTED);
             write(&forces, shapes.len(), group * LANES, &mut out);
         }
         out

@@ -89,9 +89,9 @@ fn shape_held(
         else {
             continue;
         };
-        let patches = if wanted.held_shapes { view.held_patches() } else { Vec::new() };
+        let held = if wanted.held_shapes { view.held_places() } else { Vec::new() };
         let own = view.held_shapes().map(|(shapes, _)| shapes);
-        if let Some(shapes) = cache.change(state.model(), patches, own) {
+        if let Some(shapes) = cache.change(state.model(), held, own) {
             session.set_held_shapes(id, shapes);
         }
     }

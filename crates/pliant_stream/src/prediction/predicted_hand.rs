@@ -16,7 +16,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use pliant_modal::{Frame, GrabConfig, Hand, HeldShapes, Hold, Load, RigidMotion};
+use pliant_modal::{Frame, GrabConfig, Hand, HeldPlace, HeldShapes, Hold, Load, RigidMotion};
 
 use super::{BodyCopy, HandState, VisualCopy};
 use crate::recovery::{Forecast, Receiver};
@@ -86,6 +86,8 @@ pub struct PredictedHand {
     /// The columns of held patches in the shown state, and scratch.
     columns: Vec<f64>,
     settled: State,
+    /// The patches with shapes and where they are in the shown state.
+    places: Vec<HeldPlace>,
 }
 
 impl PredictedHand {
@@ -110,12 +112,14 @@ impl PredictedHand {
             shaped: None,
             columns: Vec::new(),
             settled: State::default(),
+            places: Vec::new(),
         }
     }
 
     /// Sets the own shapes of the patches that hands hold on the body, for what is shown.
     pub(crate) fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
         self.columns.clear();
+        self.places.clear();
         let kernel = self.replica.kernel();
         let (model, settings) = (kernel.model().clone(), *kernel.settings());
         let (modes, h) = (kernel.modes(), kernel.h());
@@ -141,6 +145,12 @@ impl PredictedHand {
         self.grabs.iter().filter(|g| g.target.is_some()).map(|g| (g.vertex, g.radius))
     }
 
+    /// Where a patch is in the shown state. Patches without shapes count as at rest.
+    pub(crate) fn place(&self, vertex: u32, radius: f64) -> HeldPlace {
+        let own = self.places.iter().find(|place| (place.vertex, place.radius) == (vertex, radius));
+        own.copied().unwrap_or(HeldPlace { vertex, radius, way: [0.0; 3] })
+    }
+
     /// Finds the columns of held patches in the shown state. The last ones are the first guess.
     fn find_columns(&mut self, receiver: &Receiver, user: UserId) {
         let Some(shaped) = &mut self.shaped else { return };
@@ -153,6 +163,8 @@ impl PredictedHand {
         let own = own.map(|g| (g.vertex, g.radius, std::array::from_fn(|k| g.reaction[k] + g.offset[k])));
         shaped.equilibrate_columns(&mut self.settled, others.chain(own));
         self.columns.clone_from(&self.settled.s);
+        self.places.clear();
+        self.places.extend(shaped.held_places(&self.settled));
     }
 
     /// The tick of the copy: the host's tick when the present target will reach the host.

@@ -170,7 +170,7 @@ impl GuestSession {
     }
 
     /// Sets the own shapes of the patches that hands hold on a body
-    /// ([`StreamedBody::held_patches`]). The host need not have them, because coordinates mean the
+    /// ([`StreamedBody::held_places`]). The host need not have them, because coordinates mean the
     /// same with and without them. An unknown body and shapes of another model are ignored.
     pub fn set_held_shapes(&mut self, body: BodyId, shapes: Option<Arc<HeldShapes>>) {
         if let Some(predicted) = self.bodies.get_mut(&body).and_then(|body| body.predicted.as_mut()) {

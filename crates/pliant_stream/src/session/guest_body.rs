@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use nalgebra::Vector3;
-use pliant_modal::{HeldShapes, ModalModel};
+use pliant_modal::{HeldPlace, HeldShapes, ModalModel};
 
 use crate::newmark::Newmark;
 use crate::playout::{LATE_ROW, PlayoutClock};
@@ -173,7 +173,7 @@ impl StreamedBody {
     /// ([`GuestSession::set_held_shapes`](crate::GuestSession::set_held_shapes)): where no hand is
     /// predicted, where the elasticity is linear, and where the stream has fewer coordinates than
     /// the model.
-    pub fn held_patches(&self) -> Vec<(u32, f64)> {
+    pub fn held_places(&self) -> Vec<HeldPlace> {
         let (Some(predicted), Some(receiver), Some(model)) = (&self.predicted, &self.receiver, &self.model)
         else {
             return Vec::new();
@@ -182,7 +182,8 @@ impl StreamedBody {
         if !whole || !self.info.settings.is_reduced(model) {
             return Vec::new();
         }
-        predicted.patches().chain(receiver.grabs().iter().map(|g| (g.vertex, g.radius))).collect()
+        let patches = predicted.patches().chain(receiver.grabs().iter().map(|g| (g.vertex, g.radius)));
+        patches.map(|(vertex, radius)| predicted.place(vertex, radius)).collect()
     }
 
     /// The own shapes of held patches in the displayed state, and their coordinates.
