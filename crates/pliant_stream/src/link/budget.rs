@@ -75,8 +75,9 @@ impl Budget {
 /// vertices.
 #[derive(Debug, Clone)]
 pub(crate) struct PatchBudget {
-    pub(crate) patches: Budget,
-    pub(crate) entries: Budget,
+    patches: Budget,
+    /// Vertices of the patches.
+    entries: Budget,
 }
 
 impl Default for PatchBudget {
@@ -91,14 +92,43 @@ impl Default for PatchBudget {
 }
 
 impl PatchBudget {
-    /// Pays for a patch, and returns whether the budget allows it.
-    pub(crate) fn spend(&mut self, now: Duration, model: &ModalModel, vertex: u32, radius: f64) -> bool {
-        self.patches.spend(now, 1.0) && self.entries.spend_or_owe(now, entries(model, vertex, radius))
+    /// What is for all users together: the patches of sixteen that spend all they can. Of 256 users,
+    /// each may at once make four patches of 64 vertices each.
+    pub(crate) fn of_all() -> Self {
+        Self { patches: Budget::new(960.0, 1024.0), entries: Budget::new(131_072.0, 65_536.0) }
+    }
+
+    /// What is one user's own of that: for 256 users, as much again as is for all.
+    pub(crate) fn of_one(now: Duration) -> Self {
+        Self { patches: Budget::empty(now, 4.0, 16.0), entries: Budget::empty(now, 512.0, 2048.0) }
+    }
+
+    /// Pays for a new patch, also from what is for all or the user's own `share` of it, and returns
+    /// whether the budgets allow it.
+    pub(crate) fn spend(
+        &mut self,
+        [all, share]: [&mut Self; 2],
+        now: Duration,
+        model: &ModalModel,
+        vertex: u32,
+        radius: f64,
+    ) -> bool {
+        // The vertices are counted last, because that takes a while.
+        if !self.patches.spend(now, 1.0) || !pay(&mut all.patches, &mut share.patches, now, 1.0) {
+            return false;
+        }
+        let entries = entries(model, vertex, radius);
+        self.entries.spend_or_owe(now, entries) && pay(&mut all.entries, &mut share.entries, now, entries)
     }
 }
 
+/// Pays from a user's own share, and where it is too small, from what is for all.
+pub(crate) fn pay(all: &mut Budget, share: &mut Budget, now: Duration, amount: f64) -> bool {
+    share.spend(now, amount) || all.spend_or_owe(now, amount)
+}
+
 /// Number of vertices within the radius, of which a patch has some or all.
-pub(crate) fn entries(model: &ModalModel, vertex: u32, radius: f64) -> f64 {
+fn entries(model: &ModalModel, vertex: u32, radius: f64) -> f64 {
     let positions = model.surface().positions();
     let Some(center) = positions.get(vertex as usize) else { return 1.0 };
     let distance2 = |p: &[f32; 3]| (0..3).map(|k| f64::from(p[k] - center[k]).powi(2)).sum::<f64>();

@@ -3,9 +3,11 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::link::{Budget, Link, PatchBudget, state_budget};
+use pliant_modal::ModalModel;
+
+use crate::link::{Budget, Link, PatchBudget, pay, state_budget};
 use crate::state::{BodyId, PeerId, Tick, UserId};
-use crate::wire::PeerBodyState;
+use crate::wire::{HeldAt, PeerBodyState};
 
 /// Number of consecutive mismatches after which the other peer's state is taken.
 const CHECKS: u32 = 3;
@@ -57,6 +59,28 @@ impl PeerBudgets {
     }
 }
 
+/// Budgets that all peers share, so that many cost no more than a few.
+///
+/// Each peer has a share of its own besides, so that the others cannot take what it needs. The
+/// share belongs to the connection and begins empty, so that nobody gains by coming anew.
+#[derive(Debug)]
+pub(super) struct SharedBudgets {
+    patches: PatchBudget,
+    late: Budget,
+}
+
+impl SharedBudgets {
+    /// What is for all peers: the late inputs of two that spend all they can.
+    pub(super) fn of_all(step: f64) -> Self {
+        Self { patches: PatchBudget::of_all(), late: Budget::new(2.0 * 192.0 / step, 512.0) }
+    }
+
+    /// What is one peer's own: an input with one hand two ticks later than all others, in each tick.
+    fn of_one(now: Duration, step: f64) -> Self {
+        Self { patches: PatchBudget::of_one(now), late: Budget::empty(now, 4.0 / step, 64.0) }
+    }
+}
+
 #[derive(Debug)]
 pub(super) struct RemotePeer {
     pub(super) link: Link,
@@ -90,6 +114,8 @@ pub(super) struct RemotePeer {
     pub(super) partial: Option<PartialState>,
     /// What the peer may cost this one. This outlives the connection.
     pub(super) budgets: PeerBudgets,
+    /// What is the peer's own of the budgets that all peers share.
+    share: SharedBudgets,
 }
 
 impl RemotePeer {
@@ -118,7 +144,25 @@ impl RemotePeer {
             asked_state: false,
             partial: None,
             budgets: PeerBudgets::new(step),
+            share: SharedBudgets::of_one(now, step),
         }
+    }
+
+    /// Pays for what is stepped again for a late input, and returns whether the budgets allow it.
+    pub(super) fn pays_for_late(&mut self, all: &mut SharedBudgets, now: Duration, cost: f64) -> bool {
+        self.budgets.late.spend(now, cost) && pay(&mut all.late, &mut self.share.late, now, cost)
+    }
+
+    /// Pays for a new patch, and returns whether the budgets allow it.
+    pub(super) fn pays_for_patch(
+        &mut self,
+        all: &mut SharedBudgets,
+        now: Duration,
+        model: &ModalModel,
+        held: &HeldAt,
+    ) -> bool {
+        let all = [&mut all.patches, &mut self.share.patches];
+        self.budgets.patches.spend(all, now, model, held.vertex, held.radius)
     }
 
     /// Returns whether the peer has connected by itself and said nothing since.
@@ -150,5 +194,37 @@ impl RemotePeer {
         self.way = self.way.map(|way| way + off / 16.0);
         let jitter = self.link.stats.jitter.as_secs_f64();
         self.link.stats.jitter = Duration::from_secs_f64(jitter + (off.abs() - jitter) / 16.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_peers_that_spend_all_they_can_stay_within_the_budget_of_all_and_leave_others_their_share() {
+        let step = 0.025;
+        let mut all = SharedBudgets::of_all(step);
+        let begun = Duration::from_secs(1);
+        let peer = |k| RemotePeer::new(PeerId(k), begun, None, 1200, step);
+        let mut peers: Vec<RemotePeer> = (0..60).map(peer).collect();
+        let (mut spent, mut kept) = (0.0, 0);
+        for tick in 1..=400 {
+            let now = begun + tick * Duration::from_millis(25);
+            let (last, others) = peers.split_last_mut().unwrap();
+            for other in others {
+                while other.pays_for_late(&mut all, now, 11.0) {
+                    spent += 11.0;
+                }
+            }
+            // An input with one hand, two ticks late.
+            kept += u32::from(last.pays_for_late(&mut all, now, 4.0));
+        }
+        // Beside the first burst, two peers' worth and the shares. Each alone may spend 192 a tick.
+        let most = 512.0 + 400.0 * 2.0 * 192.0 + 59.0 * 400.0 * 4.0;
+        println!("59 peers: {spent} of {most}, and {kept} of 400 inputs of another one");
+        assert!(spent <= most + 11.0 * 400.0, "{spent} of {most}");
+        assert!(spent > 400.0 * 2.0 * 180.0, "what can be afforded is taken: {spent}");
+        assert_eq!(kept, 400);
     }
 }

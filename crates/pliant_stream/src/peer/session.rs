@@ -20,7 +20,7 @@ use repair::affords;
 use super::body::PeerBody;
 use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
-use super::other::{Hello, PeerBudgets, RemotePeer};
+use super::other::{Hello, PeerBudgets, RemotePeer, SharedBudgets};
 use crate::link::{AwayBudgets, Events};
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId};
@@ -55,6 +55,7 @@ pub struct PeerSession {
     addresses: BTreeMap<PeerId, String>,
     /// Budgets of the users that are away.
     away: AwayBudgets<PeerBudgets>,
+    shared: SharedBudgets,
     /// The time of the last update.
     updated: Duration,
     introductions: Introductions,
@@ -115,6 +116,7 @@ impl PeerSession {
             inputs.expect(config.user, 1);
         }
         Ok(Self {
+            shared: SharedBudgets::of_all(config.step),
             config,
             others: BTreeMap::new(),
             addresses: BTreeMap::new(),
@@ -279,7 +281,8 @@ impl PeerSession {
                     }
                     // What costs too much counts as lost. It is requested again, and when it has
                     // been missing for too long, a state repairs all.
-                    if !self.inputs.lacks(user, tick) || !affords(now, other, &self.bodies, &input, planned) {
+                    let pays = (&mut *other, &mut self.shared);
+                    if !self.inputs.lacks(user, tick) || !affords(now, pays, &self.bodies, &input, planned) {
                         continue;
                     }
                     if self.inputs.put(user, input) && tick <= self.tick {

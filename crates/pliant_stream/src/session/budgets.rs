@@ -5,7 +5,7 @@ use std::time::Duration;
 use pliant_modal::ModalModel;
 
 use super::host_peer::{GuestPeer, MAX_GUEST_GRABS};
-use crate::link::{Budget, PatchBudget, entries, state_budget};
+use crate::link::{Budget, PatchBudget, pay, state_budget};
 use crate::wire::MAX_BODIES;
 
 /// Largest number of impulses of one guest at once.
@@ -60,37 +60,21 @@ impl GuestBudgets {
 /// share belongs to the connection and begins empty, so that nobody gains by coming anew.
 #[derive(Debug)]
 pub(crate) struct SharedBudgets {
-    patches: Budget,
-    /// Vertices of the patches.
-    entries: Budget,
+    patches: PatchBudget,
     impulses: Budget,
 }
 
 impl SharedBudgets {
-    /// What is for all guests: the patches of sixteen and the impulses of sixty-four that spend all
-    /// they can. Of 256 guests, each may at once make four patches of 64 vertices each, and eight
-    /// impulses.
+    /// What is for all guests: the impulses of sixty-four that spend all they can. Of 256 guests,
+    /// each may at once make eight.
     pub(super) fn of_all() -> Self {
-        Self {
-            patches: Budget::new(960.0, 1024.0),
-            entries: Budget::new(131_072.0, 65_536.0),
-            impulses: Budget::new(3840.0, 2048.0),
-        }
+        Self { patches: PatchBudget::of_all(), impulses: Budget::new(3840.0, 2048.0) }
     }
 
     /// What is one guest's own: for 256 guests, as much again as is for all.
     pub(super) fn of_one(now: Duration) -> Self {
-        Self {
-            patches: Budget::empty(now, 4.0, 16.0),
-            entries: Budget::empty(now, 512.0, 2048.0),
-            impulses: Budget::empty(now, 15.0, 30.0),
-        }
+        Self { patches: PatchBudget::of_one(now), impulses: Budget::empty(now, 15.0, 30.0) }
     }
-}
-
-/// Pays from the guest's own share, and where it is too small, from what is for all.
-fn pay(all: &mut Budget, own: &mut Budget, now: Duration, amount: f64) -> bool {
-    own.spend(now, amount) || all.spend_or_owe(now, amount)
 }
 
 impl GuestPeer {
@@ -104,13 +88,8 @@ impl GuestPeer {
         vertex: u32,
         radius: f64,
     ) -> bool {
-        let (own, share) = (&mut self.budgets.patches, &mut self.share);
-        // The vertices are counted last, because that takes a while.
-        if !own.patches.spend(now, 1.0) || !pay(&mut all.patches, &mut share.patches, now, 1.0) {
-            return false;
-        }
-        let entries = entries(model, vertex, radius);
-        own.entries.spend_or_owe(now, entries) && pay(&mut all.entries, &mut share.entries, now, entries)
+        let all = [&mut all.patches, &mut self.share.patches];
+        self.budgets.patches.spend(all, now, model, vertex, radius)
     }
 
     /// Pays for an impulse, and returns whether the budgets allow it.

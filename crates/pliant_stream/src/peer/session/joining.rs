@@ -194,7 +194,8 @@ impl PeerSession {
             // Without a hand in its last input, nothing was extrapolated.
             if let Some(last) = inputs.newest().filter(|last| again > 0 && !last.held.is_empty()) {
                 // The user pays for the ticks as for a late input. Otherwise a state repairs all.
-                if other.budgets.late.spend(self.updated, late_cost(&self.bodies, last, again)) {
+                let cost = late_cost(&self.bodies, last, again);
+                if other.pays_for_late(&mut self.shared, self.updated, cost) {
                     self.rollback_from = Some(from);
                 } else {
                     self.others.values_mut().for_each(|o| o.lost = true);

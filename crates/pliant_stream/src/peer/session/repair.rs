@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::{BodyId, PeerBody, PeerId, PeerSession, RemotePeer, Tick, WINDOW};
-use crate::wire::{Datagram, HeldAt, InputTick, Inputs, MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TICKS, NackRun};
+use super::{BodyId, PeerBody, PeerId, PeerSession, RemotePeer, SharedBudgets, Tick, WINDOW};
+use crate::wire::{Datagram, InputTick, Inputs, MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TICKS, NackRun};
 
 /// What a tick that is stepped again with contacts costs more than one without.
 const CONTACT_COST: u64 = 4;
@@ -89,24 +89,23 @@ impl PeerSession {
     }
 }
 
-/// Pays for an input from the budgets of its sender, and returns whether they allow it: the ticks
+/// Pays for an input from the budgets of its sender and of all, and returns whether they allow it: the ticks
 /// before `planned` that are stepped again for it, and the patches that no body has yet.
 pub(super) fn affords(
     now: Duration,
-    other: &mut RemotePeer,
+    (other, all): (&mut RemotePeer, &mut SharedBudgets),
     bodies: &BTreeMap<BodyId, PeerBody>,
     input: &InputTick,
     planned: Tick,
 ) -> bool {
     let again = planned.saturating_sub(input.tick);
-    let patch = |held: &HeldAt| match bodies.get(&held.body) {
-        Some(body) if !body.has_patch(held.vertex, held.radius) => {
-            other.budgets.patches.spend(now, body.model(), held.vertex, held.radius)
-        }
-        _ => true,
-    };
-    (again == 0 || other.budgets.late.spend(now, late_cost(bodies, input, again)))
-        && input.held.iter().all(patch)
+    (again == 0 || other.pays_for_late(all, now, late_cost(bodies, input, again)))
+        && input.held.iter().all(|held| match bodies.get(&held.body) {
+            Some(body) if !body.has_patch(held.vertex, held.radius) => {
+                other.pays_for_patch(all, now, body.model(), held)
+            }
+            _ => true,
+        })
 }
 
 /// What it costs to step a number of ticks again for an input.
