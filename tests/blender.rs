@@ -75,8 +75,8 @@ fn a_file_becomes_a_body_with_both_of_its_materials() {
         assert!(!mesh.contains_attribute(Mesh::ATTRIBUTE_JOINT_INDEX));
         assert!(!world.entity(*part).contains::<SkinnedMesh>());
     }
-    // It bends under gravity. `blender_picture` looks at what is drawn then: without a camera nothing
-    // is deformed.
+    // It bends under gravity. `blender_picture` looks at what is drawn then: without a camera
+    // nothing is deformed.
     (0..80).for_each(|_| app.update());
     let q = app.world().get::<BodyState>(body).unwrap().body().q();
     assert!(q.iter().any(|q| q.abs() > 1e-3), "{q:?}");

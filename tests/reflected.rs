@@ -23,7 +23,7 @@ use pliant::{
 const CRATES: [&str; 4] = ["pliant_body", "pliant_contact", "pliant_net", "pliant_haptics"];
 
 /// The public components and resources that are not registered, and why.
-const WITHOUT: [(&str, &str); 14] = [
+const WITHOUT: [(&str, &str); 15] = [
     ("BakeRequest", "may hold code of the game, which cannot be saved"),
     ("Bakery", "bakes that are running"),
     ("BodyState", "a solver that runs; a saved world has SavedState in its place"),
@@ -38,6 +38,7 @@ const WITHOUT: [(&str, &str); 14] = [
     ("NetPeer", "open connections"),
     ("ProbeState", "a solver that runs; it is made again from its TouchProbe"),
     ("PointerSource", "a handle of a running device"),
+    ("RigidBodies", "what a tick sees of another engine's bodies"),
 ];
 
 /// The same for what is left: `Rumble` has the channel to the gamepads.

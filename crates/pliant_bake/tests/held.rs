@@ -151,8 +151,8 @@ fn four_hands_that_twist_a_bar_feel_the_full_solution() {
     }
 }
 
-/// Columns are made anew while the hand goes on. It feels no kicks, and whoever leads a body out and
-/// back gets no energy from it.
+/// Columns are made anew while the hand goes on. It feels no kicks, and whoever leads a body out
+/// and back gets no energy from it.
 #[test]
 fn columns_that_follow_a_hand_give_it_no_kicks_and_no_energy() {
     let model = model(&slender(), &config());

@@ -62,8 +62,8 @@ pub struct ModalBody {
     pub half_basis: bool,
     /// Whether a body of reduced elasticity gets the own shapes of its held patches
     /// ([`HeldShapesCache`](crate::HeldShapesCache)), without which the force in the hand is off by
-    /// some ten percent. They are made on a compute thread, and a step takes some 40 % longer with
-    /// them. Default: `true`.
+    /// five to fifty percent. They are made on a compute thread, anew when a hand goes on, and a
+    /// step takes some 30 % longer with them. Default: `true`.
     pub held_shapes: bool,
     /// Speed below which the body rests, m/s of the model. The body rests after the root mean
     /// square speed of its mass has stayed below this speed for half a second without a grab. A

@@ -14,9 +14,10 @@ use crate::{BodyState, Driven, ModalBody};
 ///
 /// Shapes take up to some seconds to make. They are made on Bevy's compute threads when a hand
 /// takes hold, and made anew for where the hand is when it has led the patch farther
-/// ([`HeldShapes::wanted`]); the old ones serve until then. Until there are any, the hand feels what
-/// the coordinates of the model leave out as a mere compliance. Shapes that were made once stay for
-/// the next time that the same patches are held about there, as long as they are among the last 32.
+/// ([`HeldShapes::wanted`]); the old ones serve until then. Until there are any, the hand feels
+/// what the coordinates of the model leave out as a mere compliance. Shapes that were made once
+/// stay for the next time that the same patches are held about there, as long as they are among the
+/// last 32.
 #[derive(Resource, Default)]
 pub struct HeldShapesCache {
     /// The entry that was used last is at the end.
@@ -88,7 +89,21 @@ impl HeldShapesCache {
         own: Option<&Arc<HeldShapes>>,
     ) -> Option<Option<Arc<HeldShapes>>> {
         let places = HeldShapes::wanted(model, held, own.map(|own| &**own))?;
-        self.get(model, &places).filter(|shapes| shapes.is_some() || own.is_some())
+        let found = self.get(model, &places).or_else(|| {
+            // Shapes of the same patches that were made elsewhere serve until then.
+            let same = |other: &HeldShapes| {
+                let patch = |place: HeldPlace| (place.vertex, place.radius.to_bits());
+                other.places().map(patch).eq(places.iter().copied().map(patch))
+            };
+            let made = self.entries.iter().rev().filter(|entry| entry.model == model.hash());
+            let mut made = made.filter_map(|entry| match &entry.shapes {
+                Making::Done(Some(shapes)) => Some(shapes),
+                _ => None,
+            });
+            let other = if own.is_some_and(|own| same(own)) { None } else { made.find(|made| same(made)) };
+            other.cloned().map(Some)
+        });
+        found.filter(|shapes| shapes.is_some() || own.is_some())
     }
 
     /// Whether shapes are being made.

@@ -21,12 +21,8 @@ pub(crate) struct SimulateArgs {
 }
 
 pub(crate) fn run(args: &SimulateArgs) -> Result<(), CliError> {
-    let settings = SimulateSettings {
-        from: args.from,
-        seeds: args.seeds,
-        kinds: &FaultKind::ALL,
-        memory: None,
-    };
+    let settings =
+        SimulateSettings { from: args.from, seeds: args.seeds, kinds: &FaultKind::ALL, memory: None };
     let report = simulate(&settings, &mut Bar::new()).map_err(CliError::from)?;
     if args.json {
         output::print_json(&report)?

@@ -564,7 +564,7 @@ fn a_late_renewal_sends_zero_first() {
     let service = Service::start(true);
     let mut device = Inverse::open(second(service.config())).unwrap();
     let pull = Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO };
-    let mut pulls = |device: &mut Inverse| {
+    let pulls = |device: &mut Inverse| {
         machine::until("1 N on the motors", || {
             let sample = device.exchange(&pull, &mut pacing());
             let motor = service.desk().motor;

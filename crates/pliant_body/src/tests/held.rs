@@ -8,7 +8,7 @@ use std::{
 use bevy::{math::DVec3, prelude::*};
 use pliant_bake::{BakeConfig, Material, bake};
 use pliant_mesh::shapes;
-use pliant_modal::{Elasticity, ModalModel};
+use pliant_modal::{Elasticity, HeldPlace, ModalModel};
 
 use super::{app, refusals, spawn_with, state, steps};
 use crate::{Grab, GrabForce, GrabOf, HeldShapesCache, ModalBody, VisualState};
@@ -68,11 +68,24 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
     // The hand need not wait for them.
     assert!(app.world().get::<GrabForce>(hands[0]).unwrap().force.length() > 0.0);
     wait_for_shapes(&mut app, body);
-    steps(&mut app, 400);
+    let begun = Instant::now();
+    for _ in 0..20 {
+        steps(&mut app, 20);
+        while app.world().resource::<HeldShapesCache>().is_making() {
+            assert!(begun.elapsed() < Duration::from_secs(120));
+            std::thread::sleep(Duration::from_millis(2));
+            steps(&mut app, 1);
+        }
+    }
     assert!(!has_shapes(&app, plain) && refusals(&mut app).is_empty());
     let [with, without] = hands.map(|hand| app.world().get::<GrabForce>(hand).unwrap().force);
     let change = (with - without).length() / without.length();
     assert!((0.003..0.2).contains(&change), "{with} N with and {without} N without shapes");
+    // They have followed the hand, to about where it is.
+    let place = state(&app, body).body().held_places().next().unwrap();
+    let made = state(&app, body).body().held_shapes().unwrap().places().next().unwrap();
+    let away = DVec3::from(place.way).distance(made.way.into());
+    assert!(away < 0.02 + 0.25 * DVec3::from(made.way).length(), "{made:?} for {place:?}");
     // The surface that is shown is the body's own.
     let visual = app.world().get::<VisualState>(body).unwrap();
     let (shapes, s) = visual.held().unwrap();
@@ -133,18 +146,19 @@ fn a_body_of_fewer_coordinates_or_of_linear_elasticity_gets_no_shapes() {
 fn the_cache_is_bounded_and_knows_what_has_no_shapes() {
     let _app = app();
     let mut cache = HeldShapesCache::default();
+    let at = |vertex| HeldPlace { vertex, radius: 0.1, way: [0.0; 3] };
     let linear = Arc::new(super::model::bar());
-    assert!(matches!(cache.get(&linear, &[(0, 0.1)]), Some(None)), "a linear model");
+    assert!(matches!(cache.get(&linear, &[at(0)]), Some(None)), "a linear model");
     let model = Arc::new(bar());
     assert!(matches!(cache.get(&model, &[]), Some(None)), "no patch");
-    assert!(matches!(cache.get(&model, &[(0, 0.1); 5]), Some(None)), "too many patches");
-    assert!(cache.get(&model, &[(1_000_000, 0.1)]).is_none());
+    assert!(matches!(cache.get(&model, &[at(0); 5]), Some(None)), "too many patches");
+    assert!(cache.get(&model, &[at(1_000_000)]).is_none());
     let begun = Instant::now();
     while cache.is_making() {
         assert!(begun.elapsed() < Duration::from_secs(60));
         std::thread::sleep(Duration::from_millis(1));
         // A patch that the model does not have is refused once.
-        cache.get(&model, &[(1_000_000, 0.1)]);
+        cache.get(&model, &[at(1_000_000)]);
     }
-    assert!(matches!(cache.get(&model, &[(1_000_000, 0.1)]), Some(None)));
+    assert!(matches!(cache.get(&model, &[at(1_000_000)]), Some(None)));
 }

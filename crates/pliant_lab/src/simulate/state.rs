@@ -67,7 +67,8 @@ impl Processes {
         self.is(process, FaultKind::Crash, now)
     }
 
-    /// Whether all threads of a process stand still. One that is starved gets one look in eight to forty.
+    /// Whether all threads of a process stand still. One that is starved gets one look in eight to
+    /// forty.
     fn is_stalled(&self, process: usize, now: Duration) -> bool {
         let look = (now.as_micros() / LOOK.as_micros()) as usize;
         let starved = self.is(process, FaultKind::Starvation, now);

@@ -16,10 +16,10 @@
 //! use of attachment modes in substructure coupling for dynamic analysis*, 1977). Together with the
 //! coordinates they get a cubature rule of their own.
 //!
-//! Where a hand pulls far, shapes of second order are not enough. The body is therefore led to where
-//! the hands are, and the residual forces of the full elements there, under the stiffness at rest,
-//! are further columns, again and again: the columns follow the hands. Those that the shapes on the
-//! way use most are kept. When a hand has gone on, the columns are made anew.
+//! Where a hand pulls far, shapes of second order are not enough. The body is therefore led to
+//! where the hands are, and the residual forces of the full elements there, under the stiffness at
+//! rest, are further columns, again and again: the columns follow the hands. Those that the shapes
+//! on the way use most are kept. When a hand has gone on, the columns are made anew.
 //!
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 

@@ -92,8 +92,8 @@ impl Default for PatchBudget {
 }
 
 impl PatchBudget {
-    /// What is for all users together: the patches of sixteen that spend all they can. Of 256 users,
-    /// each may at once make four patches of 64 vertices each.
+    /// What is for all users together: the patches of sixteen that spend all they can. Of 256
+    /// users, each may at once make four patches of 64 vertices each.
     pub(crate) fn of_all() -> Self {
         Self { patches: Budget::new(960.0, 1024.0), entries: Budget::new(131_072.0, 65_536.0) }
     }

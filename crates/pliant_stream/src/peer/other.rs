@@ -75,7 +75,8 @@ impl SharedBudgets {
         Self { patches: PatchBudget::of_all(), late: Budget::new(2.0 * 192.0 / step, 512.0) }
     }
 
-    /// What is one peer's own: an input with one hand two ticks later than all others, in each tick.
+    /// What is one peer's own: an input with one hand two ticks later than all others, in each
+    /// tick.
     fn of_one(now: Duration, step: f64) -> Self {
         Self { patches: PatchBudget::of_one(now), late: Budget::empty(now, 4.0 / step, 64.0) }
     }

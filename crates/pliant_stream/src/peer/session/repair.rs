@@ -89,8 +89,8 @@ impl PeerSession {
     }
 }
 
-/// Pays for an input from the budgets of its sender and of all, and returns whether they allow it: the ticks
-/// before `planned` that are stepped again for it, and the patches that no body has yet.
+/// Pays for an input from the budgets of its sender and of all, and returns whether they allow it:
+/// the ticks before `planned` that are stepped again for it, and the patches that no body has yet.
 pub(super) fn affords(
     now: Duration,
     (other, all): (&mut RemotePeer, &mut SharedBudgets),
