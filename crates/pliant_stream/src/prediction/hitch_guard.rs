@@ -7,7 +7,8 @@
 //! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
 //! second, until the host has the hand where this guest sent it. The same holds for a second after
 //! another's hand has come or gone, after a jump of the hand itself, and after an event that has
-//! changed what the copy predicts by more than a twentieth of that measure. Where no frame comes at all, the reaction fades.
+//! changed what the copy predicts by more than a twentieth of that measure.
+//! Where no frame comes at all, the reaction fades.
 
 use std::collections::VecDeque;
 use std::time::Duration;
