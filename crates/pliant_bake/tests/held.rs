@@ -151,6 +151,42 @@ fn four_hands_that_twist_a_bar_feel_the_full_solution() {
     }
 }
 
+/// A hand on the clamped end, or two on nearly one patch, take the shapes from no other hand.
+#[test]
+fn hands_that_cannot_move_or_lie_in_each_other_leave_the_others_their_shapes() {
+    let model = model(&slender(), &config());
+    let around = |at, radius| Patch::around(model.surface(), vertex(&model, at), radius).unwrap();
+    let end = around([1.0, 0.1, 0.1], 0.05);
+    let others = [around([0.0, 0.1, 0.05], 0.02), around([1.0, 0.1, 0.1], 0.0502)];
+    let mut forces = Vec::new();
+    for other in [None, Some(&others[0]), Some(&others[1])] {
+        let mut body = reduced(&model, 1.0 / 60.0, 30.0);
+        let grab = body.grab(&end, GrabConfig::default()).unwrap();
+        let mut hands = vec![(grab, [0.0, 0.1, 0.05])];
+        if let Some(other) = other {
+            let second = body.grab(other, GrabConfig::default()).unwrap();
+            hands.push((second, if std::ptr::eq(other, &others[1]) { hands[0].1 } else { [0.0; 3] }));
+        }
+        lead_with(&mut body, &hands, true);
+        assert!(body.held_shapes().is_some());
+        let sum = match hands.len() {
+            2 if other.is_some_and(|other| std::ptr::eq(other, &others[1])) => {
+                let [a, b] = [0, 1].map(|i| body.reaction(hands[i].0).unwrap());
+                std::array::from_fn(|k| a[k] + b[k])
+            }
+            _ => body.reaction(grab).unwrap(),
+        };
+        forces.push(sum);
+    }
+    println!(
+        "alone {:.3?} N, with a hand on the clamped end {:.3?}, with one beside {:.3?}",
+        forces[0], forces[1], forces[2]
+    );
+    for force in &forces[1..] {
+        assert!(norm(minus(*force, forces[0])) < 0.05 * norm(forces[0]), "{forces:?}");
+    }
+}
+
 /// Columns are made anew while the hand goes on. It feels no kicks, and whoever leads a body out
 /// and back gets no energy from it.
 #[test]

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use bevy::{
+    math::DVec3,
     prelude::*,
     tasks::{AsyncComputeTaskPool, Task, block_on, poll_once},
 };
@@ -27,9 +28,10 @@ pub struct HeldShapesCache {
 /// The number of entries that are kept. One takes up to about a megabyte.
 const MAX: usize = 32;
 
-/// The number of entries that are made at a time. Whoever grabs one patch after another occupies no
-/// more of the compute threads, and bodies that wait are served later.
-const MAX_MAKING: usize = 4;
+/// The number of entries that are made at a time. Making those of four hands takes some hundred
+/// megabytes. Whoever grabs one patch after another occupies no more of the compute threads, and
+/// bodies that wait are served later.
+const MAX_MAKING: usize = 2;
 
 struct Entry {
     model: ModelHash,
@@ -48,17 +50,14 @@ impl HeldShapesCache {
     /// The result is `None` while they are being made, which the first call begins, and
     /// `Some(None)` where there are none: see [`HeldShapes::of_places`].
     pub fn get(&mut self, model: &Arc<ModalModel>, places: &[HeldPlace]) -> Option<Option<Arc<HeldShapes>>> {
+        let is_finite =
+            |place: &HeldPlace| place.radius.is_finite() && place.way.iter().all(|x| x.is_finite());
         let has_mesh = model.parts().reduced.as_ref().is_some_and(|reduced| reduced.mesh.is_some());
-        if places.is_empty() || places.len() > HeldShapes::MAX_PATCHES || !has_mesh {
+        let is_few = !places.is_empty() && places.len() <= HeldShapes::MAX_PATCHES;
+        if !is_few || !has_mesh || !places.iter().all(is_finite) {
             return Some(None);
         }
-        for entry in &mut self.entries {
-            if let Making::Task(task) = &mut entry.shapes
-                && let Some(shapes) = block_on(poll_once(task))
-            {
-                entry.shapes = Making::Done(shapes.map(Arc::new));
-            }
-        }
+        self.take_made();
         let is_made = |entry: &Entry| matches!(entry.shapes, Making::Done(_));
         let entry = match self.entries.iter().position(|e| e.model == model.hash() && e.places == places) {
             Some(index) => self.entries.remove(index),
@@ -89,21 +88,46 @@ impl HeldShapesCache {
         own: Option<&Arc<HeldShapes>>,
     ) -> Option<Option<Arc<HeldShapes>>> {
         let places = HeldShapes::wanted(model, held, own.map(|own| &**own))?;
-        let found = self.get(model, &places).or_else(|| {
-            // Shapes of the same patches that were made elsewhere serve until then.
-            let same = |other: &HeldShapes| {
-                let patch = |place: HeldPlace| (place.vertex, place.radius.to_bits());
-                other.places().map(patch).eq(places.iter().copied().map(patch))
-            };
-            let made = self.entries.iter().rev().filter(|entry| entry.model == model.hash());
-            let mut made = made.filter_map(|entry| match &entry.shapes {
-                Making::Done(Some(shapes)) => Some(shapes),
+        self.take_made();
+        let key = |place: &HeldPlace| (place.vertex, place.radius.to_bits());
+        // How far from the hands shapes were made, m. Those of further patches serve, too.
+        let away = |shapes: &HeldShapes| {
+            places.iter().try_fold(0.0f64, |most, place| {
+                let made = shapes.places().find(|made| key(made) == key(place))?;
+                Some(most.max(DVec3::from(made.way).distance(place.way.into())))
+            })
+        };
+        let is_of = |entry: &&Entry| {
+            entry.model == model.hash() && entry.places.iter().map(key).eq(places.iter().map(key))
+        };
+        // A hand that goes on asks for ever new ones. One set at a time is made for it.
+        let is_known = self.entries.iter().filter(is_of).any(|entry| entry.places == places);
+        let is_busy = self.entries.iter().filter(is_of).any(|e| matches!(e.shapes, Making::Task(_)));
+        let found = if is_known || !is_busy { self.get(model, &places) } else { None };
+        let now = own.and_then(|own| away(own)).filter(|_| !places.is_empty());
+        // Until then, those serve that were made nearest to the hands.
+        let found = found.or_else(|| {
+            let made = self.entries.iter().filter(is_of).filter_map(|entry| match &entry.shapes {
+                Making::Done(Some(shapes)) => Some((away(shapes)?, shapes)),
                 _ => None,
             });
-            let other = if own.is_some_and(|own| same(own)) { None } else { made.find(|made| same(made)) };
-            other.cloned().map(Some)
+            let nearest = made.min_by(|a, b| a.0.total_cmp(&b.0));
+            let nearest = nearest.filter(|(away, _)| now.is_none_or(|now| *away < now));
+            nearest.map(|(_, shapes)| Some(shapes.clone()))
         });
-        found.filter(|shapes| shapes.is_some() || own.is_some())
+        // Where none can be made, those that the body has of these patches are better than none.
+        found.filter(|shapes| shapes.is_some() || (own.is_some() && now.is_none()))
+    }
+
+    /// Takes the shapes that are ready.
+    fn take_made(&mut self) {
+        for entry in &mut self.entries {
+            if let Making::Task(task) = &mut entry.shapes
+                && let Some(shapes) = block_on(poll_once(task))
+            {
+                entry.shapes = Making::Done(shapes.map(Arc::new));
+            }
+        }
     }
 
     /// Whether shapes are being made.

@@ -115,18 +115,22 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
     let mut shapes_ms: Option<f64> = None;
     let mut shape = |body: &mut Body| {
         let begun = Instant::now();
-        if body.make_held_shapes()? {
+        let changed = body.make_held_shapes()?;
+        if changed {
             let took = begun.elapsed().as_secs_f64() * 1e3;
             shapes_ms = Some(shapes_ms.map_or(took, |most| most.max(took)));
         }
-        Ok::<_, LabError>(())
+        Ok::<_, LabError>(changed)
     };
     let start = Vector3::from(body.grab_position(grab)?);
     let by = Vector3::from(pull.by);
 
     let mut times = Vec::new();
     let mut timed = |body: &mut Body, part: f64| {
-        shape(body)?;
+        // Steps with other shapes take another time.
+        if shape(body)? {
+            times.clear();
+        }
         body.set_target(grab, (start + part * by).into())?;
         let begun = Instant::now();
         body.step()?;

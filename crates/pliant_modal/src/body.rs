@@ -52,6 +52,8 @@ impl From<StepSettings> for BodyConfig {
 #[derive(Debug, Clone)]
 pub struct Body {
     config: BodyConfig,
+    /// Held patches for which there were no shapes.
+    without: Vec<HeldPlace>,
     kernel: Kernel,
     state: State,
     /// Modal force from [`Body::push`], constant over one step.
@@ -106,6 +108,7 @@ impl Body {
             hands: Vec::new(),
             grabs: Vec::new(),
             next_grab: 1,
+            without: Vec::new(),
             contacts: Contacts::default(),
             single: vec![0.0; zero.len()],
             drawn: zero.clone(),
@@ -276,7 +279,7 @@ impl Body {
         }
         config.check()?;
         let patch = HeldPatch::new(self.model(), patch, self.mode_count())?;
-        let local = patch.rest() + patch.displacement(&self.state.q, self.kernel.warps());
+        let local = patch.rest() + self.way(&patch);
         let target = self.state.frame.to_world(local);
         let id = GrabId(self.next_grab);
         self.next_grab += 1;
@@ -333,7 +336,8 @@ impl Body {
     }
 
     /// Makes the own shapes of the held patches anew where those that the body has do not suffice
-    /// ([`HeldShapes::wanted`]). That takes up to a second: between frames it is done beside them.
+    /// ([`HeldShapes::wanted`]). That takes half a second to some seconds: a
+    /// game makes them beside its frames.
     /// Returns whether the body has got others.
     ///
     /// # Errors
@@ -348,8 +352,17 @@ impl Body {
         let Some(places) = HeldShapes::wanted(self.model(), self.held_places(), own) else {
             return Ok(false);
         };
+        if places == self.without {
+            return Ok(false);
+        }
         let shapes = HeldShapes::of_places(self.model(), &places)?.map(Arc::new);
-        let changes = shapes.is_some() || self.held_shapes().is_some();
+        // Of the same patches, the old ones are better than none.
+        let patch = |place: HeldPlace| (place.vertex, place.radius.to_bits());
+        let same = |own: &Arc<HeldShapes>| own.places().map(patch).eq(places.iter().copied().map(patch));
+        let changes = shapes.is_some() || self.held_shapes().is_some_and(|own| !same(own));
+        if shapes.is_none() {
+            self.without = places;
+        }
         if changes {
             self.set_held_shapes(shapes)?;
         }

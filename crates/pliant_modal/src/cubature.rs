@@ -84,6 +84,9 @@ pub fn guided_shapes(
     out
 }
 
+/// Compliance of the hold of several patches, as a share of the largest of their own.
+const RIDGE: f64 = 1e-4;
+
 /// Number of Newton rounds that find a shape.
 pub(crate) const ROUNDS: usize = 5;
 
@@ -129,7 +132,12 @@ pub(crate) fn hold(
         };
         let soft: Vec<Vec<f64>> = (0..rows).map(solved).collect();
         let gap = DVector::from_fn(rows, |k, _| there[k / 3][k % 3] - dot(row(k), &q) + dot(row(k), &free));
-        let inner = DMatrix::from_fn(rows, rows, |a, b| dot(row(a), &soft[b]));
+        let mut inner = DMatrix::from_fn(rows, rows, |a, b| dot(row(a), &soft[b]));
+        if patches.len() > 1 {
+            // Patches that cannot move, or that lie in each other, are held nearly there.
+            let ridge = RIDGE * inner.diagonal().amax();
+            (0..rows).for_each(|k| inner[(k, k)] += ridge);
+        }
         forces = inner.lu().solve(&gap)?;
         let (mut way, mut length) = (0.0, 0.0);
         for (i, q) in q.iter_mut().enumerate() {

@@ -314,15 +314,11 @@ impl Replica {
         self.release_all();
     }
 
-    /// The patches of the shapes that hands hold, and where they are in a state.
-    pub(crate) fn held_places(&mut self, state: &State) -> Vec<HeldPlace> {
-        let Some(shapes) = self.kernel.held_shapes().cloned() else { return Vec::new() };
-        let place = |HeldPlace { vertex, radius, .. }| {
-            let modal = self.patch(vertex, radius)?.displacement(&state.q, self.kernel.warps());
-            let own = Vector3::from(shapes.mean(vertex, radius, &state.s).unwrap_or_default());
-            Some(HeldPlace { vertex, radius, way: (modal + own).into() })
-        };
-        shapes.places().filter_map(place).collect()
+    /// Where a held patch is in a state. `None` for a patch that the model does not have.
+    pub(crate) fn held_place(&mut self, state: &State, vertex: u32, radius: f64) -> Option<HeldPlace> {
+        let modal = self.patch(vertex, radius)?.displacement(&state.q, self.kernel.warps());
+        let own = self.kernel.held_shapes().and_then(|shapes| shapes.mean(vertex, radius, &state.s));
+        Some(HeldPlace { vertex, radius, way: (modal + Vector3::from(own.unwrap_or_default())).into() })
     }
 
     /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].

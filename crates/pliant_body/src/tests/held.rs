@@ -112,6 +112,26 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
 }
 
 #[test]
+fn a_hand_that_does_not_stand_still_gets_new_shapes_on_its_way() {
+    let mut app = app();
+    let body = spawn_with(&mut app, bar(), reduced, ());
+    let rest = DVec3::new(1.0, 0.1, 0.1);
+    let hand = hold(&mut app, body, rest);
+    wait_for_shapes(&mut app, body);
+    let (begun, mut turn, mut farthest) = (Instant::now(), 0.0f64, 0.0f64);
+    while farthest < 0.05 {
+        assert!(begun.elapsed() < Duration::from_secs(120), "the shapes stay those at rest");
+        turn += 0.01;
+        let to = rest + DVec3::new(0.0, 0.15 * turn.sin(), 0.1 * (0.7 * turn).sin());
+        app.world_mut().get_mut::<Grab>(hand).unwrap().target = to;
+        steps(&mut app, 1);
+        std::thread::sleep(Duration::from_millis(2));
+        let shapes = state(&app, body).body().held_shapes().unwrap();
+        farthest = shapes.places().map(|place| DVec3::from(place.way).length()).fold(farthest, f64::max);
+    }
+}
+
+#[test]
 fn a_body_of_fewer_coordinates_or_of_linear_elasticity_gets_no_shapes() {
     let mut app = app();
     let few = spawn_with(

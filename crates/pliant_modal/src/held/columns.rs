@@ -30,6 +30,9 @@ const SHARES: [f64; 4] = [0.35, 0.7, 1.0, 1.25];
 /// at least as a share of the body's size.
 const BESIDE: [f64; 2] = [0.25, 0.04];
 
+/// Largest energy density of a shape beside, as a share of Young's modulus.
+const ENERGY: f64 = 0.02;
+
 /// Number of times that shapes on the ways of hands are corrected, and the number of columns that
 /// each time adds.
 const CORRECTIONS: (usize, usize) = (3, 6);
@@ -44,7 +47,7 @@ const KEPT: [usize; 2] = [6, 2];
 /// Number of points from which those are taken.
 const OUTSIDE_ALL: usize = 2_000;
 
-/// The six directions in which hands go in training shapes.
+/// The six directions in which hands are beside the ends of their ways.
 const DIRECTIONS: [Vector3<f64>; 6] = [
     Vector3::new(1.0, 0.0, 0.0),
     Vector3::new(-1.0, 0.0, 0.0),
@@ -64,7 +67,6 @@ fn widened(shapes: &[GuidedShape], width: usize, more: usize) -> Vec<GuidedShape
 }
 
 /// Columns on a region.
-#[derive(Clone)]
 pub(super) struct Columns {
     /// Displacements `X`, `[node][axis][column]`.
     pub(super) values: Vec<f64>,
@@ -121,21 +123,20 @@ impl Columns {
         ways: &[Vector3<f64>],
     ) -> Option<(Self, Vec<GuidedShape>)> {
         let mut columns = self;
-        let points_of = [OUTSIDE, usize::MAX];
-        let points = columns.some_points(model, region, points_of);
+        let points = columns.some_points(model, region);
         let mut shapes = led(model, law, &columns.omega(model), &points, &columns.rows(region, loads), ways)?;
         let (times, more) = CORRECTIONS;
         for _ in 0..times {
             let Some(new) = columns.corrections(model, region, loads, law, &shapes, more) else { break };
             shapes = widened(&shapes, columns.width, new.width);
             columns = columns.with(&new);
-            let points = columns.some_points(model, region, points_of);
+            let points = columns.some_points(model, region);
             shapes = columns.again(model, region, loads, law, &points, shapes)?;
         }
         let keep = KEPT[0] + KEPT[1] * (loads.len() - 1);
         let (columns, shapes) =
             columns.compressed(&columns.rows(region, loads), model.omega(), shapes, keep)?;
-        let points = columns.some_points(model, region, points_of);
+        let points = columns.some_points(model, region);
         let shapes = columns.again(model, region, loads, law, &points, shapes)?;
         (!shapes.is_empty()).then_some((columns, shapes))
     }
@@ -162,7 +163,7 @@ impl Columns {
             q[i] / energy(q).max(f64::MIN_POSITIVE).sqrt()
         });
         let statics = orthonormal_basis(statics, 3 * rows.len(), 1e-6)?;
-        let rest = &used - &statics * (statics.transpose() * &used);
+        let rest = &used - product(&statics, &product(&statics.transpose(), &used));
         let combine = match orthonormal_basis(rest, keep, 1e-6) {
             Some(more) => {
                 let columns: Vec<_> =
@@ -185,15 +186,10 @@ impl Columns {
         Some((out, shapes))
     }
 
-    /// Points of about so many elements outside and inside of the region.
-    fn some_points(
-        &self,
-        model: &ModalModel,
-        region: &Region<'_>,
-        [outside, inside]: [usize; 2],
-    ) -> Vec<Point> {
-        let all = region.outside(model.size(), OUTSIDE_ALL);
-        let places = [thinned(&all, outside), thinned(&region.inside(), inside)].concat();
+    /// Some points outside of the region and all inside.
+    fn some_points(&self, model: &ModalModel, region: &Region<'_>) -> Vec<Point> {
+        let outside = thinned(&region.outside(model.size(), OUTSIDE_ALL), OUTSIDE);
+        let places = [outside, region.inside()].concat();
         region.points(&places, self, &region.node_rows(self))
     }
 
@@ -292,13 +288,13 @@ impl Columns {
             DMatrix::from_fn(rows, width, |i, j| both[i * width + j] - soft(&others.parts, [i, rows], j))
         });
         if let Some(shared) = &shared {
-            left -= shared.transpose() * shared;
+            left -= product(&shared.transpose(), shared);
         }
         let combine = orthonormal(left, least, most)?;
         let mut values = combined(&self.values, &combine);
         let mut parts = combined(&parts, &combine);
         if let (Some(others), Some(shared)) = (others, shared) {
-            let theirs = shared * &combine;
+            let theirs = product(&shared, &combine);
             let take = |from: &mut [f64], rows: &[f64]| {
                 from.iter_mut().zip(combined(rows, &theirs)).for_each(|(x, part)| *x -= part);
             };
@@ -376,23 +372,34 @@ fn led(
         }
         out.push(shape);
     }
+    let most = ENERGY * model.info().young * energy.volume();
     let beside = (BESIDE[0] * far).max(BESIDE[1] * model.size());
     for index in 0..patches.len() {
         for direction in &DIRECTIONS {
             let mut there = ways.to_vec();
             there[index] += beside * direction;
             if let Some(shape) = cubature::hold(&mut energy, omega, patches, &there, &end, cubature::ROUNDS) {
-                out.push(shape);
+                // Hands side by side would be torn apart.
+                if energy.energy(&shape.q) <= most {
+                    out.push(shape);
+                }
             }
         }
     }
     Some(out)
 }
 
+/// The product of two matrices. Its sums have a fixed order without fused products, so that it is
+/// the same on every machine.
+fn product(a: &DMatrix<f64>, b: &DMatrix<f64>) -> DMatrix<f64> {
+    let entry = |i, j| (0..a.ncols()).map(|k| a[(i, k)] * b[(k, j)]).sum();
+    DMatrix::from_fn(a.nrows(), b.ncols(), entry)
+}
+
 /// Orthonormal columns that span a matrix: at most `most`, and none whose singular value is below
 /// `least` of the largest. Returns `None` for a matrix of zeros.
 fn orthonormal_basis(matrix: DMatrix<f64>, most: usize, least: f64) -> Option<DMatrix<f64>> {
-    let gram = &matrix * matrix.transpose();
+    let gram = product(&matrix, &matrix.transpose());
     if !gram.iter().all(|x| x.is_finite()) {
         return None;
     }

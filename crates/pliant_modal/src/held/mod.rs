@@ -96,7 +96,8 @@ const NEAR_SHARE: f64 = 0.25;
 
 /// The own shapes of the patches that hands hold on a body with reduced elasticity.
 ///
-/// They are made once, which takes about half a second, and shared by all copies of the body.
+/// They are made for where the hands are, which takes half a second to some seconds, and shared by
+/// all copies of the body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeldShapes {
     model: ModelHash,

@@ -229,7 +229,7 @@ impl<'a> Region<'a> {
         let mut moved = false;
         self.vertex(vertex, &mut |node, share| {
             let Ok(at) = self.numbers.binary_search(&node) else { return };
-            if !self.free_for_any[at] {
+            if !self.free_for_any[at] && !self.free.iter().any(|free| free[at]) {
                 return;
             }
             if !moved {

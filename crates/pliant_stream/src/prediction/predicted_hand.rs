@@ -86,7 +86,7 @@ pub struct PredictedHand {
     /// The columns of held patches in the shown state, and scratch.
     columns: Vec<f64>,
     settled: State,
-    /// The patches with shapes and where they are in the shown state.
+    /// The held patches and where they are in the shown state.
     places: Vec<HeldPlace>,
 }
 
@@ -119,7 +119,6 @@ impl PredictedHand {
     /// Sets the own shapes of the patches that hands hold on the body, for what is shown.
     pub(crate) fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
         self.columns.clear();
-        self.places.clear();
         let kernel = self.replica.kernel();
         let (model, settings) = (kernel.model().clone(), *kernel.settings());
         let (modes, h) = (kernel.modes(), kernel.h());
@@ -145,7 +144,7 @@ impl PredictedHand {
         self.grabs.iter().filter(|g| g.target.is_some()).map(|g| (g.vertex, g.radius))
     }
 
-    /// Where a patch is in the shown state. Patches without shapes count as at rest.
+    /// Where a held patch is in the shown state. A hand that has just come is at rest.
     pub(crate) fn place(&self, vertex: u32, radius: f64) -> HeldPlace {
         let own = self.places.iter().find(|place| (place.vertex, place.radius) == (vertex, radius));
         own.copied().unwrap_or(HeldPlace { vertex, radius, way: [0.0; 3] })
@@ -153,18 +152,29 @@ impl PredictedHand {
 
     /// Finds the columns of held patches in the shown state. The last ones are the first guess.
     fn find_columns(&mut self, receiver: &Receiver, user: UserId) {
-        let Some(shaped) = &mut self.shaped else { return };
+        self.places.clear();
+        let kernel = self.replica.kernel();
+        if !kernel.settings().is_reduced(kernel.model()) {
+            return;
+        }
         self.settled.clone_from(if self.active { &self.visual.state } else { receiver.visual() });
+        if self.settled.modes() != kernel.modes() {
+            return;
+        }
         self.settled.s.clone_from(&self.columns);
         let active = self.active;
         let others = receiver.grabs().iter().filter(|g| !active || g.key.user != user);
         let others = others.map(|g| (g.vertex, g.radius, g.reaction));
         let own = self.grabs.iter().filter(|g| active && g.target.is_some());
         let own = own.map(|g| (g.vertex, g.radius, std::array::from_fn(|k| g.reaction[k] + g.offset[k])));
-        shaped.equilibrate_columns(&mut self.settled, others.chain(own));
-        self.columns.clone_from(&self.settled.s);
-        self.places.clear();
-        self.places.extend(shaped.held_places(&self.settled));
+        let held: Vec<(u32, f64, [f64; 3])> = others.chain(own).collect();
+        if let Some(shaped) = &mut self.shaped {
+            shaped.equilibrate_columns(&mut self.settled, held.iter().copied());
+            self.columns.clone_from(&self.settled.s);
+        }
+        let replica = self.shaped.as_mut().unwrap_or(&mut self.replica);
+        let place = |&(vertex, radius, _): &(u32, f64, _)| replica.held_place(&self.settled, vertex, radius);
+        self.places.extend(held.iter().filter_map(place));
     }
 
     /// The tick of the copy: the host's tick when the present target will reach the host.

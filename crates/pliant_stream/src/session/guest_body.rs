@@ -167,7 +167,7 @@ impl StreamedBody {
         self.predicted.as_ref().filter(|predicted| predicted.is_active())
     }
 
-    /// The patches that hands hold, own and others', by center vertex and radius (m).
+    /// The patches that hands hold, own and others', and where they are in the shown state.
     ///
     /// It is empty where their own shapes cannot be shown
     /// ([`GuestSession::set_held_shapes`](crate::GuestSession::set_held_shapes)): where no hand is
