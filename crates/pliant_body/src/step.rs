@@ -348,13 +348,14 @@ pub(crate) fn step_bodies(
     let step = time.delta_secs_f64();
     let mut all: Vec<_> = Vec::new();
     let probed = probes.iter().any(|(_, probe, _)| probe.enabled);
+    let pushes = rigids.as_ref().is_some_and(|rigids| !rigids.0.is_empty());
     for (name, body, driven, mut state) in &mut bodies {
         // A resting body takes part only where others may wake it.
         let steps = *driven == Driven::Local && !state.resting;
         if state.stepped != steps {
             state.stepped = steps;
         }
-        if steps || (*driven == Driven::Local && (probed || state.layers.is_some())) {
+        if steps || (*driven == Driven::Local && (probed || pushes || state.layers.is_some())) {
             all.push((name, body.rest_speed, state));
         }
     }

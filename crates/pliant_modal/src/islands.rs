@@ -397,9 +397,10 @@ impl Islands {
         };
         let probed = probes.iter().flat_map(|probe| probe.near.windows(2).map(|pair| [pair[0], pair[1]]));
         // Rigid bodies come after all bodies.
-        let rigids = self.rigids.iter().enumerate().flat_map(|(number, rigid)| {
+        let sound = self.rigids.iter().enumerate().filter(|(_, rigid)| rigid.is_sound());
+        let rigids = sound.flat_map(|(number, rigid)| {
             let own = bodies.len() + number;
-            let of = |key: [u64; 2]| self.rigids.iter().position(|other| other.key == key);
+            let of = |key| self.rigids.iter().position(|other| other.key == key && other.is_sound());
             let touched = rigid.supports.iter().filter_map(move |support| of(support.other?));
             let touched = touched.map(|other| bodies.len() + other);
             rigid.near.iter().copied().chain(touched).map(move |other| [own, other])

@@ -5,7 +5,7 @@
 //! spread over its substeps so that the rigid body goes as far as the solver took it to go.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     sync::Arc,
 };
 
@@ -17,10 +17,10 @@ use avian3d::{
     },
     parry::shape::SharedShape,
     prelude::{
-        AngularVelocity, Collider, ColliderDisabled, ColliderOf, Collisions, ComputedAngularInertia,
-        ComputedCenterOfMass, ComputedMass, ContactGraph, Gravity, GravityScale, LinearVelocity, LockedAxes,
-        Physics, PhysicsTime, Position, RigidBody, RigidBodyColliders, RigidBodyDisabled, Rotation, Sensor,
-        Sleeping,
+        AngularVelocity, Collider, ColliderDisabled, ColliderOf, ColliderTransform, Collisions,
+        ComputedAngularInertia, ComputedCenterOfMass, ComputedMass, ContactGraph, Gravity, GravityScale,
+        LinearVelocity, LockedAxes, Physics, PhysicsTime, Position, RigidBody, RigidBodyColliders,
+        RigidBodyDisabled, Rotation, Sensor, Sleeping,
     },
 };
 use bevy::{
@@ -33,7 +33,7 @@ use pliant_body::{BodyError, BodyRefused, BodyState, ModalBody, PliantSystems, P
 use pliant_modal::{self as modal, ObstacleShape, Rigid, StepError, Support, SurfacePoint};
 
 use crate::{
-    contacts::{BodyContacts, Nearby, place_obstacles, publish},
+    contacts::{BodyContacts, Nearby, place_obstacles, publish, touch_bodies},
     obstacle::{Motion, Obstacle, keep, move_obstacles},
 };
 
@@ -43,13 +43,17 @@ mod shape;
 /// number.
 const FARTHEST: f32 = 1e30;
 
+/// Number of rigid bodies in a step up to which those give way that only touch others. Those near
+/// soft bodies always do. What is farther moves as it does.
+const MOST: usize = 64;
+
 /// Acceleration that wakes a sleeping rigid body, as a share of gravity's and at least, m/s^2: what
 /// remains where soft bodies alone hold it up, and the change by their contacts elsewhere.
 const UNBALANCED: f64 = 0.005;
 const STIRRED: f64 = 0.1;
 
-/// What neither is an obstacle nor belongs to avian any more.
-pub(crate) type Gone = (With<Motion>, Without<Obstacle>, Without<Collider>);
+/// What is no obstacle any more, neither by itself nor by avian.
+pub(crate) type Gone = (With<Motion>, Without<Obstacle>, Or<(Without<Collider>, With<ModalBody>)>);
 
 /// Name of a rigid body in the worlds of bodies on entities of this uniform scale.
 pub(crate) fn key(rigid: Entity, scale: f64) -> [u64; 2] {
@@ -125,6 +129,11 @@ impl Forms {
     }
 }
 
+/// Whether avian knows this place. One with a coordinate that is no number is none.
+fn is_place(at: Vec3) -> bool {
+    at.abs().cmplt(Vec3::splat(FARTHEST)).all()
+}
+
 /// A rigid body of avian.
 #[derive(QueryData)]
 pub(crate) struct Body {
@@ -147,7 +156,7 @@ pub(crate) struct Body {
 impl BodyItem<'_, '_> {
     /// Whether forces move it.
     fn gives_way(&self) -> bool {
-        let numbers = self.position.0.abs().max_element() < FARTHEST
+        let numbers = is_place(self.position.0)
             && self.rotation.0.is_finite()
             && self.velocity.0.is_finite()
             && self.spin.0.is_finite();
@@ -228,6 +237,7 @@ type Colliders<'w, 's> = Query<
         &'static Position,
         &'static Rotation,
         Option<&'static ColliderOf>,
+        Option<&'static ColliderTransform>,
         Has<Sensor>,
         Has<ColliderDisabled>,
         Option<&'static mut Motion>,
@@ -245,12 +255,21 @@ fn move_colliders(
     bodies: Query<Body>,
     mut colliders: Colliders,
 ) {
-    let step = if physics.is_paused() { 0.0 } else { time.delta_secs_f64() };
+    let stands = physics.is_paused() || physics.relative_speed_f64() == 0.0;
+    let step = if stands { 0.0 } else { time.delta_secs_f64() };
     forms.tidy();
     refused.retain(|entity| colliders.contains(*entity));
-    for (entity, collider, position, rotation, of, sensor, disabled, motion) in &mut colliders {
-        let known = position.0.abs().max_element() < FARTHEST && rotation.0.is_finite();
+    for (entity, collider, position, rotation, of, local, sensor, disabled, motion) in &mut colliders {
         let body = of.and_then(|of| bodies.get(of.body).ok());
+        let (position, rotation) = match (&body, local) {
+            // The place of a collider on a child is a tick old.
+            (Some(body), Some(local)) if body.entity != entity => {
+                let turn = body.rotation.0;
+                (body.position.0 + turn * local.translation, turn * local.rotation.0)
+            }
+            _ => (position.0, rotation.0),
+        };
+        let known = is_place(position) && rotation.is_finite();
         let off = sensor || disabled || !known || body.as_ref().is_some_and(|body| body.disabled);
         let form = if off { None } else { Some(forms.get(collider.shape_scaled())) };
         let form = match form {
@@ -268,8 +287,7 @@ fn move_colliders(
             }
         };
         let now = form.map(|form| {
-            let mut pose =
-                Pose { origin: position.0.as_dvec3(), orientation: rotation.0.as_dquat().normalize() };
+            let mut pose = Pose { origin: position.as_dvec3(), orientation: rotation.as_dquat().normalize() };
             let mut ways = [DVec3::ZERO; 2];
             if let Some(body) = body.as_ref().filter(|_| step > 0.0) {
                 let [velocity, spin] = body.motion();
@@ -300,7 +318,7 @@ pub(crate) fn build(app: &mut App, schedule: InternedScheduleLabel) {
                 .after(move_obstacles)
                 .before(place_obstacles)
                 .run_if(running),
-            gather.after(place_obstacles).before(PliantSystems::Step).run_if(running),
+            gather.after(place_obstacles).after(touch_bodies).before(PliantSystems::Step).run_if(running),
             push.after(PliantSystems::Step).before(PliantSystems::Publish).run_if(running),
             wake.after(publish).run_if(running),
         )
@@ -323,7 +341,7 @@ fn present(
 struct Places(Vec<Vec<(ContactId, usize, usize)>>);
 
 /// Lists the rigid bodies that give way in this step: those near soft bodies, and those that touch
-/// them.
+/// them, up to [`MOST`].
 fn gather(
     gravity: Res<Gravity>,
     collisions: Collisions,
@@ -341,8 +359,9 @@ fn gather(
         let near = nearby.slots.iter().flatten().filter_map(|entity| motions.get(*entity).ok()?.rigid);
         found.extend(near.map(|rigid| (state.scale().to_bits(), rigid)));
     }
-    let mut open: Vec<_> = found.iter().copied().collect();
-    while let Some((bits, entity)) = open.pop() {
+    // The nearest come first.
+    let mut open: VecDeque<_> = found.iter().copied().collect();
+    while let Some((bits, entity)) = open.pop_front() {
         let Ok(body) = bodies.get(entity) else { continue };
         let scale = f64::from_bits(bits);
         let (mut rigid, mut own) = (body.rigid(&gravity, scale), Vec::new());
@@ -355,9 +374,12 @@ fn gather(
                 continue;
             };
             let Ok(other) = bodies.get(other) else { continue };
-            let gives_way = other.gives_way();
-            if gives_way && found.insert((bits, other.entity)) {
-                open.push((bits, other.entity));
+            let one = (bits, other.entity);
+            let mut gives_way = found.contains(&one);
+            if !gives_way && found.len() < MOST && other.gives_way() {
+                gives_way = true;
+                found.insert(one);
+                open.push_back(one);
             }
             // Of two that give way, one has the contact.
             if gives_way && other.entity < entity {
@@ -366,7 +388,7 @@ fn gather(
             let [velocity, spin] = other.motion();
             for (m, manifold) in pair.manifolds.iter().enumerate() {
                 let normal = sign * manifold.normal.as_dvec3();
-                if (normal.length() - 1.0).abs() > 1e-3 {
+                if !normal.is_finite() || (normal.length() - 1.0).abs() > 1e-3 {
                     continue;
                 }
                 for (p, point) in manifold.points.iter().enumerate() {
@@ -430,7 +452,8 @@ fn push(
         let sleeps = body.sleeps;
         if sleeps {
             let last = *asleep.0.entry(entity).or_insert([pushed, turned]);
-            let alone = rigid.supports.iter().all(|support| support.force <= 0.0);
+            // What no soft body held up when it fell asleep needs none now.
+            let alone = last != [DVec3::ZERO; 2] && !rigid.is_held;
             let most = gravity.length().max(1.0);
             let stirred = body.stirs([pushed - last[0], turned - last[1]], STIRRED * most)
                 || alone && body.stirs([pushed + gravity, turned], UNBALANCED * most);
@@ -494,8 +517,8 @@ fn wake(
     let mut held: BTreeSet<Entity> =
         touched.filter_map(|contact| colliders.get(contact.other).ok()).map(|of| of.body).collect();
     held.extend(list.0.iter().filter_map(|rigid| Entity::try_from_bits(rigid.key[0])));
-    asleep.0.retain(|entity, _| {
-        let stays = held.contains(entity);
+    asleep.0.retain(|entity, last| {
+        let stays = *last == [DVec3::ZERO; 2] || held.contains(entity);
         if !stays {
             commands.queue_silenced(WakeBody(*entity));
         }

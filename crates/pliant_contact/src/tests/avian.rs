@@ -2,7 +2,10 @@
 
 use avian3d::prelude::*;
 
+use pliant_body::RigidBodies;
+
 use super::*;
+use crate::obstacle::Motion;
 
 fn avian(gravity: f32) -> App {
     app_with(|app| {
@@ -244,4 +247,60 @@ fn what_is_removed_sensed_or_no_number_does_no_harm() {
     app.world_mut().despawn(body);
     seconds(&mut app, 1.0);
     assert!(place(&app, last).y < 0.12, "{}", place(&app, last));
+}
+
+#[test]
+fn a_crate_that_no_body_touches_sleeps_on_and_lets_its_neighbor_rest() {
+    let mut app = earth();
+    let floor = (RigidBody::Static, Collider::half_space(Vec3::Y));
+    app.world_mut().spawn((floor, Transform::default()));
+    let rigid = brick(&mut app, Vec3::new(0.3, 0.1, 0.0), Vec3::splat(0.2), 4.0);
+    seconds(&mut app, 3.0);
+    assert!(app.world().get::<Sleeping>(rigid).is_some());
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.12, 0.0), ());
+    let mut listed = false;
+    for _ in 0..360 {
+        app.update();
+        listed |= !app.world().resource::<RigidBodies>().0.is_empty();
+        assert!(app.world().get::<Sleeping>(rigid).is_some());
+    }
+    assert!(listed && !contacts(&app, body).touches(rigid) && state(&app, body).is_resting());
+}
+
+#[test]
+fn a_collider_on_a_child_is_where_its_body_takes_it() {
+    let mut app = earth();
+    let moving = (RigidBody::Kinematic, LinearVelocity(2.0 * Vec3::Y), AngularVelocity(Vec3::Y));
+    let rigid = app.world_mut().spawn((moving, Transform::default())).id();
+    let child = (Collider::sphere(0.1), Transform::from_xyz(0.5, 0.0, 0.0), ChildOf(rigid));
+    let child = app.world_mut().spawn(child).id();
+    for tick in 0..20 {
+        app.update();
+        if tick < 3 {
+            continue;
+        }
+        let turn = app.world().get::<Rotation>(rigid).unwrap().0.as_dquat();
+        let at = place(&app, rigid) + turn * DVec3::new(0.5, 0.0, 0.0);
+        let distance = app.world().get::<Motion>(child).unwrap().distance(1.0, &at.to_array().into());
+        assert!((distance + 0.1).abs() < 1e-4, "{distance} m at {tick}");
+    }
+}
+
+#[test]
+fn a_body_stays_on_a_crate_that_only_turns() {
+    let mut app = earth();
+    let floor = (RigidBody::Static, Collider::half_space(Vec3::Y));
+    app.world_mut().spawn((floor, Transform::default()));
+    let rigid = brick(&mut app, Vec3::new(0.0, 0.149, 0.0), Vec3::new(0.5, 0.3, 0.5), 4.0);
+    app.world_mut().entity_mut(rigid).insert(LockedAxes::TRANSLATION_LOCKED);
+    seconds(&mut app, 1.0);
+    let body = spawn(&mut app, Transform::from_xyz(0.05, 0.42, 0.02), ());
+    seconds(&mut app, 8.0);
+    let mut spin = 0.0f32;
+    for _ in 0..120 {
+        app.update();
+        spin = spin.max(app.world().get::<AngularVelocity>(rigid).unwrap().0.length());
+    }
+    println!("the crate turns by up to {spin:e} rad/s, body at {}", center(&app, body));
+    assert!((center(&app, body).y - 0.4).abs() < 0.01 && spin < 0.01);
 }

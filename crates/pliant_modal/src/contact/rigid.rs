@@ -68,6 +68,14 @@ pub struct Support {
     pub force: f64,
 }
 
+impl Support {
+    /// Whether all numbers are finite.
+    pub(crate) fn is_sound(&self) -> bool {
+        let vectors = [self.point, self.normal, self.velocity];
+        vectors.iter().flatten().chain(&[self.gap, self.friction]).all(|x| x.is_finite())
+    }
+}
+
 impl Rigid {
     /// Whether all numbers are finite.
     pub(crate) fn is_sound(&self) -> bool {
@@ -150,9 +158,13 @@ impl Rigid {
         }
     }
 
-    /// Largest inverse mass, 1/kg.
-    pub(crate) fn lightness(&self) -> f64 {
-        self.inverse_mass.iter().copied().fold(0.0, f64::max)
+    /// Largest inverse mass, 1/kg. Of a body that only turns, a bound of that at `point` (m).
+    pub(crate) fn lightness(&self, point: &Vector3<f64>) -> f64 {
+        let largest = self.inverse_mass.iter().copied().fold(0.0, f64::max);
+        if largest > 0.0 {
+            return largest;
+        }
+        self.inertia().trace().max(0.0) * (point - Vector3::from(self.center)).norm_squared()
     }
 
     /// Forgets what the last step has set.

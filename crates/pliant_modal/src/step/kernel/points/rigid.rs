@@ -48,17 +48,21 @@ pub(in super::super) fn support<P: Member>(group: &Group<'_, P>, work: &mut Touc
     let first = group.len() + group.held.len();
     for (number, &index) in group.pushed.iter().enumerate() {
         let rigid = &group.rigids[index];
-        for (at, support) in rigid.supports.iter().enumerate() {
+        for (at, support) in rigid.supports.iter().enumerate().filter(|(_, support)| support.is_sound()) {
             let mut point = ContactPoint::new(first + number, at, Touched::Obstacle(index), support.friction);
             point.support = Some(AtSupport { rigid: index, support: at, arm: Vector3::zeros() });
             let place = Vector3::from(support.point);
             let other = support.other.and_then(|key| find(group, key));
-            let mut light = rigid.lightness();
+            let mut light = rigid.lightness(&place);
             point.rigid = other.map(|[rigid, span]| {
-                light = light.max(group.rigids[rigid].lightness());
+                light = light.max(group.rigids[rigid].lightness(&place));
                 let zero = Vector3::zeros();
                 AtRigid { rigid, span, middle: place, arm: zero, carried: zero, anchor: place }
             });
+            // Forces at this place move neither, and without compliance the law would be singular.
+            if !(light > 0.0 && light.is_finite()) {
+                continue;
+            }
             (point.start, point.place, point.gap) = (place, place, support.gap);
             point.compliance = Matrix3::identity() * (SOFT * group.h * group.h * light);
             point.turn(&Vector3::from(support.normal));
