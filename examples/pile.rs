@@ -10,7 +10,10 @@
 
 mod stage;
 
-use std::time::{Duration, Instant};
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
 
 use avian3d::prelude::{Collider, ColliderDensity, LinearVelocity, PhysicsPlugins, RigidBody};
 use bevy::{color::Mix, prelude::*};
@@ -18,6 +21,9 @@ use pliant::prelude::*;
 use stage::{Look, Readout, Stage};
 
 const BODIES: usize = 50;
+
+/// Number of steps whose time is shown.
+const STEPS: usize = 600;
 
 fn main() -> AppExit {
     App::new()
@@ -34,18 +40,21 @@ fn main() -> AppExit {
         .add_systems(Startup, (place, drop_all))
         .add_systems(FixedFirst, |mut steps: ResMut<Steps>| steps.begun = Some(Instant::now()))
         .add_systems(FixedLast, |mut steps: ResMut<Steps>| {
-            let took = steps.begun.take().map(|begun| begun.elapsed());
-            steps.took.extend(took);
+            let Some(begun) = steps.begun.take() else { return };
+            if steps.took.len() >= STEPS {
+                steps.took.pop_front();
+            }
+            steps.took.push_back(begun.elapsed());
         })
         .add_systems(Update, (again, write))
         .run()
 }
 
-/// What the fixed steps of both engines took.
+/// What the last fixed steps of both engines took.
 #[derive(Resource, Default)]
 struct Steps {
     begun: Option<Instant>,
-    took: Vec<Duration>,
+    took: VecDeque<Duration>,
 }
 
 /// What falls.
@@ -122,7 +131,7 @@ fn write(
     let pushed =
         crates.iter().filter(|(entity, _)| bodies.iter().any(|(contacts, _)| contacts.touches(*entity)));
     let fastest = crates.iter().map(|(_, velocity)| velocity.length()).fold(0.0, f32::max);
-    let mut took = steps.took.clone();
+    let mut took: Vec<Duration> = steps.took.iter().copied().collect();
     took.sort_unstable();
     let share = |share: f64| {
         let index = (share * took.len().saturating_sub(1) as f64) as usize;
