@@ -124,7 +124,7 @@ fn write(
     mut readout: ResMut<Readout>,
     steps: Res<Steps>,
     bodies: Query<(&BodyContacts, &BodyState)>,
-    crates: Query<(Entity, &LinearVelocity), With<RigidBody>>,
+    crates: Query<(Entity, &LinearVelocity), (With<RigidBody>, With<Falls>)>,
 ) {
     let places: usize = bodies.iter().map(|(contacts, _)| contacts.0.len()).sum();
     let resting = bodies.iter().filter(|(_, state)| state.is_resting()).count();
