@@ -14,7 +14,10 @@ use super::{
     lanes::{LANES, Lane},
     principal::positive_roots,
 };
-use crate::{HeldShapes, ModalModel, ModelError, ReducedElasticity};
+use crate::{
+    HeldShapes, ModalModel, ModelError, ReducedElasticity,
+    simd::{Doubles, Kernel, Lanes, with_registers},
+};
 
 /// Number of coordinates in one block of the tangent's columns.
 const WIDTH: usize = 16;
@@ -177,245 +180,307 @@ impl ElasticEnergy {
 
     /// Elastic energy, J.
     pub fn energy(&self, q: &[f64]) -> f64 {
-        #[cfg(target_arch = "x86_64")]
-        {
-            if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-                // SAFETY: The check above found AVX2 and FMA.
-                return unsafe { self.energy_avx2(q) };
-            }
-        }
-        self.energy_with(q)
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn energy_avx2(&self, q: &[f64]) -> f64 {
-        self.energy_with(q)
-    }
-
-    #[inline(always)]
-    fn energy_with(&self, q: &[f64]) -> f64 {
-        let (q, stride) = (&q[..self.modes.min(q.len())], self.gradients.padded);
-        let mut sum = 0.0;
-        // A closure would not be compiled for the registers of this function.
-        for (weight, rows) in self.points() {
-            sum += weight * self.law.energy(&gradient(rows, stride, q));
-        }
-        sum
+        with_registers(EnergyAt { energy: self, q: Blocks::of(&q[..self.modes.min(q.len())]) })
     }
 
     /// Writes the elastic force `dU/dq` at `q`, kg^1/2 m/s^2.
     pub fn force_at(&self, q: &[f64], out: &mut [f64]) {
-        #[cfg(target_arch = "x86_64")]
-        {
-            if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-                // SAFETY: The check above found AVX2 and FMA.
-                return unsafe { self.force_at_avx2(q, out) };
-            }
-        }
-        self.force_at_with(q, out);
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn force_at_avx2(&self, q: &[f64], out: &mut [f64]) {
-        self.force_at_with(q, out);
-    }
-
-    #[inline(always)]
-    fn force_at_with(&self, q: &[f64], out: &mut [f64]) {
-        let (q, stride) = (&q[..self.modes.min(q.len())], self.gradients.padded);
-        let given = self.modes.min(out.len());
-        let out = &mut out[..given];
-        out.fill(0.0);
-        for (weight, rows) in self.points() {
-            let stress: Matrix3<f64> = weight * self.law.stress(&gradient(rows, stride, q));
-            for (stress, row) in stress.iter().zip(rows.chunks_exact(stride)) {
-                out.iter_mut().zip(row).for_each(|(out, g)| *out = stress.mul_add(f64::from(*g), *out));
-            }
-        }
+        let q = Blocks::of(&q[..self.modes.min(q.len())]);
+        let mut force = vec![0.0; self.padded];
+        with_registers(ForceAt { energy: self, q, out: &mut force });
+        out.iter_mut().zip(&force[..self.modes]).for_each(|(out, force)| *out = *force);
     }
 
     /// Computes the force alone at `q`. The tangent stays that of the last linearization.
     pub fn compute_force(&mut self, q: &[f64]) {
         self.load(q);
-        self.dispatch(false);
+        with_registers(Linearize { energy: self, tangent: false });
     }
 
     /// Computes force and positive semidefinite tangent at `q`.
     pub fn linearize(&mut self, q: &[f64]) {
         self.load(q);
-        self.dispatch(true);
+        with_registers(Linearize { energy: self, tangent: true });
     }
+}
 
-    fn dispatch(&mut self, tangent: bool) {
-        #[cfg(target_arch = "x86_64")]
-        {
-            if std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("fma") {
-                // SAFETY: The check above found AVX-512F and FMA.
-                unsafe { self.linearize_avx512(tangent) };
-                return;
-            }
-            if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-                // SAFETY: The check above found AVX2 and FMA.
-                unsafe { self.linearize_avx2(tangent) };
-                return;
-            }
-        }
-        self.linearize_with(tangent);
-    }
+struct EnergyAt<'a> {
+    energy: &'a ElasticEnergy,
+    q: Blocks<'a>,
+}
 
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx512f,fma")]
-    fn linearize_avx512(&mut self, tangent: bool) {
-        self.linearize_with(tangent);
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn linearize_avx2(&mut self, tangent: bool) {
-        self.linearize_with(tangent);
-    }
-
+impl Kernel for EnergyAt<'_> {
+    type Out = f64;
     #[inline(always)]
-    fn linearize_with(&mut self, tangent: bool) {
-        let (modes, padded, stride) = (self.modes, self.padded, self.gradients.padded);
-        let gradients = self.gradients.clone();
-        self.force.fill(0.0);
-        if tangent {
-            self.tangent.fill(0.0);
-            self.raised = 0;
+    unsafe fn run<D: Doubles, L: Lanes>(self) -> f64 {
+        let energy = self.energy;
+        let mut sum = 0.0;
+        // A closure would not be compiled for the registers of this function.
+        for (weight, rows) in energy.points() {
+            // SAFETY: The caller has checked for the instruction set.
+            let h = unsafe { gradient::<D>(rows, energy.gradients.padded, &self.q) };
+            sum += weight * energy.law.energy(&Matrix3::from_column_slice(&h));
         }
-        let groups = self.weights.chunks(LANES).zip(gradients.values.chunks(9 * stride * LANES));
-        for ((weights, values), scaled) in groups.zip(gradients.scaled.chunks(9 * stride * LANES)) {
-            // Lanes beyond the last point are at rest.
-            let mut h = [Lane::splat(0.0); 9];
-            for (lane, rows) in values.chunks_exact(9 * stride).enumerate() {
-                let own = gradient(rows, stride, &self.q);
-                h.iter_mut().zip(own.iter()).for_each(|(h, own)| h.0[lane] = *own);
+        sum
+    }
+}
+
+struct ForceAt<'a> {
+    energy: &'a ElasticEnergy,
+    q: Blocks<'a>,
+    /// Padded to whole blocks.
+    out: &'a mut [f64],
+}
+
+impl Kernel for ForceAt<'_> {
+    type Out = ();
+    #[inline(always)]
+    unsafe fn run<D: Doubles, L: Lanes>(self) {
+        let (energy, stride) = (self.energy, self.energy.gradients.padded);
+        for (weight, rows) in energy.points() {
+            // SAFETY: The caller has checked for the instruction set.
+            unsafe {
+                let mut stress = energy.law.stresses(&gradient::<D>(rows, stride, &self.q));
+                for stress in &mut stress {
+                    *stress *= weight;
+                }
+                add_force::<D>(&stress, rows, stride, self.out);
             }
-            let stress = self.law.stresses(&h);
-            for (lane, (&weight, rows)) in weights.iter().zip(values.chunks_exact(9 * stride)).enumerate() {
-                let own = Matrix3::from_fn(|r, c| weight * stress[3 * c + r].0[lane]);
-                add_force(&own, rows, stride, &mut self.force);
+        }
+    }
+}
+
+/// Force and, if asked for, tangent at the coordinates that the energy has loaded.
+struct Linearize<'a> {
+    energy: &'a mut ElasticEnergy,
+    tangent: bool,
+}
+
+impl Kernel for Linearize<'_> {
+    type Out = ();
+    #[inline(always)]
+    unsafe fn run<D: Doubles, L: Lanes>(self) {
+        let Self { energy, tangent } = self;
+        let (modes, padded, stride) = (energy.modes, energy.padded, energy.gradients.padded);
+        let (gradients, q) = (energy.gradients.clone(), Blocks::of(&energy.q));
+        energy.force.fill(0.0);
+        if tangent {
+            energy.tangent.fill(0.0);
+            energy.raised = 0;
+        }
+        let groups = energy.weights.chunks(LANES).zip(gradients.values.chunks(9 * stride * LANES));
+        for ((weights, values), scaled) in groups.zip(gradients.scaled.chunks(9 * stride * LANES)) {
+            // Lanes beyond the last point are at rest and have no weight.
+            let (mut h, mut share) = ([Lane::splat(0.0); 9], Lane::splat(0.0));
+            share.0[..weights.len()].copy_from_slice(weights);
+            for (lane, rows) in values.chunks_exact(9 * stride).enumerate() {
+                // SAFETY: The caller has checked for the instruction set.
+                let own = unsafe { gradient::<D>(rows, stride, &q) };
+                for (h, own) in h.iter_mut().zip(own) {
+                    h.0[lane] = own;
+                }
+            }
+            let mut stress = energy.law.stresses(&h);
+            for stress in &mut stress {
+                *stress = *stress * share;
+            }
+            for (lane, rows) in values.chunks_exact(9 * stride).enumerate() {
+                let own = std::array::from_fn(|e| stress[e].0[lane]);
+                // SAFETY: The caller has checked for the instruction set.
+                unsafe { add_force::<D>(&own, rows, stride, &mut energy.force) };
             }
             if !tangent {
                 continue;
             }
-            let mut f = h;
-            (0..3).for_each(|k| f[4 * k] = f[4 * k] + Lane::splat(1.0));
-            let roots = positive_roots(self.law, &f);
-            let points = weights.iter().zip(scaled.chunks_exact(9 * stride));
-            let mut outs = self.rows.chunks_exact_mut(padded);
-            let mut kept = 0;
-            for (lane, (&weight, rows)) in points.enumerate() {
-                self.raised += usize::from(roots.least.0[lane] < 0.0);
-                let share = weight.sqrt();
-                let mut factors = [[0.0f32; 9]; 9];
-                for (factors, roots) in factors.iter_mut().zip(&roots.rows) {
-                    for (factor, root) in factors.iter_mut().zip(roots) {
-                        *factor = (share * root.0[lane]) as f32;
-                    }
-                }
-                // Rows of eigenvalues that were raised to zero add nothing.
-                for factors in factors.iter().filter(|factors| factors.iter().any(|x| *x != 0.0)) {
-                    if let Some(out) = outs.next() {
-                        combine(factors, rows, stride, out);
-                        kept += 1;
-                    }
-                }
+            for k in 0..3 {
+                h[4 * k] = h[4 * k] + Lane::splat(1.0);
             }
-            add_squares(&self.rows[..padded * kept], modes, padded, &mut self.tangent);
+            let roots = positive_roots(energy.law, &h);
+            let factors = singles(&roots.rows, share.sqrt());
+            let mut kept = 0;
+            for (lane, rows) in scaled.chunks_exact(9 * stride).enumerate() {
+                energy.raised += usize::from(roots.least.0[lane] < 0.0);
+                // Rows of eigenvalues that were raised to zero add nothing.
+                let (mut of, mut count) = ([0; 9], 0);
+                for (k, size) in roots.sizes.iter().enumerate() {
+                    of[count] = k;
+                    count += usize::from(size.0[lane] != 0.0);
+                }
+                let outs = &mut energy.rows[kept * padded..];
+                // SAFETY: The caller has checked for the instruction set.
+                unsafe { combine::<L>(&factors, lane, &of[..count], rows, [stride, padded], outs) };
+                kept += count;
+            }
+            // SAFETY: The caller has checked for the instruction set.
+            unsafe { add_squares::<L>(&energy.rows[..padded * kept], modes, padded, &mut energy.tangent) };
         }
+    }
+}
+
+/// Coordinates in whole blocks: the last one has zeros beyond the last coordinate.
+struct Blocks<'a> {
+    whole: &'a [[f64; LANES]],
+    last: Option<[f64; LANES]>,
+}
+
+impl<'a> Blocks<'a> {
+    #[inline(always)]
+    fn of(q: &'a [f64]) -> Self {
+        let (whole, tail) = q.as_chunks::<LANES>();
+        let mut last = [0.0; LANES];
+        last[..tail.len()].copy_from_slice(tail);
+        Self { whole, last: (!tail.is_empty()).then_some(last) }
     }
 }
 
 /// Displacement gradient of a point, from its rows of `stride` entries, of which `q` may cover the
 /// first.
 #[inline(always)]
-fn gradient(rows: &[f32], stride: usize, q: &[f64]) -> Matrix3<f64> {
-    let (rows, (q, tail)) = (rows.as_chunks::<LANES>().0, q.as_chunks::<LANES>());
-    let blocks = stride / LANES;
-    let mut sums = [[0.0f64; LANES]; 9];
-    if !tail.is_empty() {
-        for (row, sum) in rows.chunks_exact(blocks).zip(&mut sums) {
-            for ((sum, row), q) in sum.iter_mut().zip(&row[q.len()]).zip(tail) {
-                *sum = f64::from(*row) * q;
+unsafe fn gradient<D: Doubles>(rows: &[f32], stride: usize, q: &Blocks<'_>) -> [f64; 9] {
+    let (rows, blocks) = (rows.as_chunks::<LANES>().0, stride / LANES);
+    // SAFETY: The caller has checked for the instruction set.
+    unsafe {
+        let mut sums = [D::splat(0.0); 9];
+        for (block, q) in q.whole.iter().chain(&q.last).enumerate() {
+            let q = D::load(q);
+            for e in 0..9 {
+                sums[e] = D::load_single(&rows[e * blocks + block]).fused(q, sums[e]);
             }
         }
-    }
-    for (block, q) in q.iter().enumerate() {
-        for (e, sum) in sums.iter_mut().enumerate() {
-            let row = &rows[e * blocks + block];
-            for k in 0..LANES {
-                sum[k] = f64::from(row[k]).mul_add(q[k], sum[k]);
-            }
+        let mut h = [0.0; 9];
+        for e in 0..9 {
+            let mut s = [0.0; LANES];
+            sums[e].store(&mut s);
+            h[e] = ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
         }
+        h
     }
-    let mut h = Matrix3::zeros();
-    for (h, s) in h.iter_mut().zip(&sums) {
-        *h = ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]));
-    }
-    h
 }
 
 /// Adds the force of a point with this stress times its weight.
 #[inline(always)]
-fn add_force(stress: &Matrix3<f64>, rows: &[f32], stride: usize, out: &mut [f64]) {
+unsafe fn add_force<D: Doubles>(stress: &[f64; 9], rows: &[f32], stride: usize, out: &mut [f64]) {
     let (rows, out) = (rows.as_chunks::<LANES>().0, out.as_chunks_mut::<LANES>().0);
     let blocks = stride / LANES;
-    for (block, out) in out.iter_mut().enumerate() {
-        let mut sum = *out;
+    // SAFETY: The caller has checked for the instruction set.
+    unsafe {
+        let mut factors = [D::splat(0.0); 9];
         for e in 0..9 {
-            let row = &rows[e * blocks + block];
-            for k in 0..LANES {
-                sum[k] = stress[e].mul_add(f64::from(row[k]), sum[k]);
-            }
+            factors[e] = D::splat(stress[e]);
         }
-        *out = sum;
+        let one = D::splat(1.0);
+        for (block, out) in out.iter_mut().enumerate() {
+            // Three sums at once hide the time that each addition takes.
+            let mut sums = [D::splat(0.0); 3];
+            for e in 0..9 {
+                let row = D::load_single(&rows[e * blocks + block]);
+                sums[e % 3] = factors[e].fused(row, sums[e % 3]);
+            }
+            let sum = one.fused(sums[0], sums[1]);
+            one.fused(one.fused(sum, sums[2]), D::load(out)).store(out);
+        }
     }
 }
 
-/// Writes the combination of nine rows of a point with these factors.
+/// Rows times `share`, in single precision.
 #[inline(always)]
-fn combine(factors: &[f32; 9], rows: &[f32], stride: usize, out: &mut [f32]) {
-    let (rows, out) = (rows.as_chunks::<WIDTH>().0, out.as_chunks_mut::<WIDTH>().0);
-    let from = stride / WIDTH;
-    for (block, out) in out.iter_mut().enumerate() {
-        let mut sum = [0.0f32; WIDTH];
-        for (e, factor) in factors.iter().enumerate() {
-            let row = &rows[e * from + block];
-            for k in 0..WIDTH {
-                sum[k] = factor.mul_add(row[k], sum[k]);
+fn singles(rows: &[[Lane; 9]; 9], share: Lane) -> [[[f32; LANES]; 9]; 9] {
+    let mut out = [[[0.0; LANES]; 9]; 9];
+    for (out, row) in out.iter_mut().zip(rows) {
+        for (out, x) in out.iter_mut().zip(row) {
+            let x = share * *x;
+            for (out, x) in out.iter_mut().zip(&x.0) {
+                *out = *x as f32;
             }
         }
-        *out = sum;
+    }
+    out
+}
+
+/// Writes combinations of the nine rows of a point with factors of its lane.
+#[inline(always)]
+unsafe fn combine<L: Lanes>(
+    factors: &[[[f32; LANES]; 9]; 9],
+    lane: usize,
+    of: &[usize],
+    rows: &[f32],
+    [stride, padded]: [usize; 2],
+    outs: &mut [f32],
+) {
+    let (rows, outs) = (rows.as_chunks::<WIDTH>().0, outs.as_chunks_mut::<WIDTH>().0);
+    let (from, blocks) = (stride / WIDTH, padded / WIDTH);
+    // SAFETY: The caller has checked for the instruction set.
+    unsafe {
+        for block in 0..blocks {
+            let mut own = [L::splat(0.0); 9];
+            for (own, row) in own.iter_mut().zip(rows.chunks_exact(from)) {
+                *own = L::load(&row[block]);
+            }
+            for (&k, outs) in of.iter().zip(outs.chunks_exact_mut(blocks)) {
+                let factors = &factors[k];
+                let mut sum = L::splat(factors[0][lane]).fused(own[0], L::splat(0.0));
+                for e in 1..9 {
+                    sum = L::splat(factors[e][lane]).fused(own[e], sum);
+                }
+                sum.store(&mut outs[block]);
+            }
+        }
     }
 }
 
 /// Adds `sum_k g_k g_k^T` for rows `g_k`: the upper triangle by blocks of columns.
 #[inline(always)]
-fn add_squares(rows: &[f32], modes: usize, padded: usize, out: &mut [f32]) {
+unsafe fn add_squares<L: Lanes>(rows: &[f32], modes: usize, padded: usize, out: &mut [f32]) {
     let blocks = padded / WIDTH;
     let (rows, out) = (rows.as_chunks::<WIDTH>().0, out.as_chunks_mut::<WIDTH>().0);
     for i in (0..modes).step_by(ROWS) {
-        let (own, inside) = (i / WIDTH, i % WIDTH);
-        for block in own..blocks {
-            let mut sums = [[0.0f32; WIDTH]; ROWS];
-            for row in rows.chunks_exact(blocks) {
-                let (columns, factors) = (&row[block], &row[own]);
-                for (r, sum) in sums.iter_mut().enumerate() {
-                    let factor = factors[(inside + r) % WIDTH];
-                    for k in 0..WIDTH {
-                        sum[k] = factor.mul_add(columns[k], sum[k]);
-                    }
+        let mut block = i / WIDTH;
+        // SAFETY: The caller has checked for the instruction set.
+        unsafe {
+            while L::MANY && block + 3 <= blocks {
+                add_tile::<L, 3>(rows, [i, block, blocks], out);
+                block += 3;
+            }
+            while L::MANY && block + 2 <= blocks {
+                add_tile::<L, 2>(rows, [i, block, blocks], out);
+                block += 2;
+            }
+            while block < blocks {
+                add_tile::<L, 1>(rows, [i, block, blocks], out);
+                block += 1;
+            }
+        }
+    }
+}
+
+/// Adds to the [`ROWS`] rows from `i` on and to `N` blocks of their columns.
+#[inline(always)]
+unsafe fn add_tile<L: Lanes, const N: usize>(
+    rows: &[[f32; WIDTH]],
+    [i, block, blocks]: [usize; 3],
+    out: &mut [[f32; WIDTH]],
+) {
+    let (own, inside) = (i / WIDTH, i % WIDTH);
+    // SAFETY: The caller has checked for the instruction set.
+    unsafe {
+        let mut sums = [[L::splat(0.0); N]; ROWS];
+        for row in rows.chunks_exact(blocks) {
+            let mut columns = [L::splat(0.0); N];
+            for n in 0..N {
+                columns[n] = L::load(&row[block + n]);
+            }
+            for r in 0..ROWS {
+                let factor = L::splat(row[own][(inside + r) % WIDTH]);
+                for n in 0..N {
+                    sums[r][n] = factor.fused(columns[n], sums[r][n]);
                 }
             }
-            for (r, sum) in sums.iter().enumerate() {
-                let out = &mut out[(i + r) * blocks + block];
-                for k in 0..WIDTH {
-                    out[k] += sum[k];
-                }
+        }
+        let one = L::splat(1.0);
+        for r in 0..ROWS {
+            for n in 0..N {
+                let out = &mut out[(i + r) * blocks + block + n];
+                one.fused(L::load(out), sums[r][n]).store(out);
             }
         }
     }
@@ -424,7 +489,7 @@ fn add_squares(rows: &[f32], modes: usize, padded: usize, out: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Material;
+    use crate::{Material, simd};
 
     /// Guests and hosts may have other processors.
     #[test]
@@ -448,17 +513,24 @@ mod tests {
             let tangent: Vec<u32> = energy.tangent.iter().map(|x| x.to_bits()).collect();
             (force, tangent, energy.raised)
         };
-        let plain = bits(&|energy| energy.linearize_with(true));
+        let plain = bits(&|energy| simd::with_arrays(Linearize { energy, tangent: true }));
         assert!(plain.2 > 0 && plain.0.iter().any(|&x| x != 0));
         #[cfg(target_arch = "x86_64")]
         {
+            let tangent = true;
             if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
                 // SAFETY: The check above found AVX2 and FMA.
-                assert!(bits(&|energy| unsafe { energy.linearize_avx2(true) }) == plain, "AVX2");
+                let run = |energy: &mut ElasticEnergy| unsafe {
+                    simd::x86::kernel_avx2(Linearize { energy, tangent })
+                };
+                assert!(bits(&run) == plain, "AVX2");
             }
             if std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("fma") {
                 // SAFETY: The check above found AVX-512F and FMA.
-                assert!(bits(&|energy| unsafe { energy.linearize_avx512(true) }) == plain, "AVX-512");
+                let run = |energy: &mut ElasticEnergy| unsafe {
+                    simd::x86::kernel_avx512(Linearize { energy, tangent })
+                };
+                assert!(bits(&run) == plain, "AVX-512");
             }
         }
     }

@@ -105,6 +105,16 @@ impl Lane {
         out
     }
 
+    /// Whether all lanes are larger than those of `other`. NaN is not.
+    #[inline(always)]
+    pub(crate) fn all_above(&self, other: &Self) -> bool {
+        let mut all = true;
+        for l in 0..LANES {
+            all &= self.0[l] > other.0[l];
+        }
+        all
+    }
+
     /// Lanes of `yes` where `self < other`, of `no` elsewhere.
     #[inline(always)]
     pub(crate) fn if_less(self, other: Self, yes: Self, no: Self) -> Self {
@@ -134,12 +144,12 @@ pub(crate) fn scaled(by: Lane, a: &Vector) -> Vector {
     [by * a[0], by * a[1], by * a[2]]
 }
 
-/// Eigenvalues and eigenvectors of symmetric matrices by five sweeps of cyclic Jacobi rotations.
+/// Eigenvalues and eigenvectors of symmetric matrices by four sweeps of cyclic Jacobi rotations.
 ///
 /// `a` holds the entries 00, 11, 22, 01, 02, 12. The vectors are `[vector][axis]`.
 #[inline(always)]
 pub(crate) fn eigen(a: [Lane; 6]) -> (Vector, [Vector; 3]) {
-    const SWEEPS: usize = 5;
+    const SWEEPS: usize = 4;
     let (zero, one) = (Lane::splat(0.0), Lane::splat(1.0));
     let mut d = [a[0], a[1], a[2]];
     // The entry beside the axes p and q lies at 2 - r of the other axis r.

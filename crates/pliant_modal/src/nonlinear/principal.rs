@@ -14,6 +14,8 @@ use super::{
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Roots {
     pub(crate) rows: [[Lane; 9]; 9],
+    /// What the entries of each row are multiples of: rows without it are zero.
+    pub(crate) sizes: [Lane; 9],
     /// The smallest eigenvalue that the tangent had before, Pa.
     pub(crate) least: Lane,
 }
@@ -58,6 +60,27 @@ fn outer(u: &Vector, v: &Vector) -> [Lane; 9] {
     out
 }
 
+/// Vectors whose squares sum to a matrix with the entries 00, 11, 22, 01, 02, 12. Returns `None`
+/// unless the matrices of all lanes are safely positive definite.
+#[inline(always)]
+fn cholesky(a: &[Lane; 6]) -> Option<[Vector; 3]> {
+    /// Least pivot, as a share of its entry of the diagonal.
+    const LEAST: f64 = 1e-6;
+    let zero = Lane::splat(0.0);
+    let mut sound = a[0].all_above(&zero);
+    let x = a[0].max(f64::MIN_POSITIVE).sqrt();
+    let inverse = Lane::splat(1.0) / x;
+    let first = [x, inverse * a[3], inverse * a[4]];
+    let y = a[1] - first[1] * first[1];
+    sound &= y.all_above(&(LEAST * a[1]));
+    let y = y.max(f64::MIN_POSITIVE).sqrt();
+    let second = [zero, y, (a[5] - first[1] * first[2]) / y];
+    let z = a[2] - first[2] * first[2] - second[2] * second[2];
+    sound &= z.all_above(&(LEAST * a[2]));
+    let z = z.max(f64::MIN_POSITIVE).sqrt();
+    sound.then_some([first, second, [zero, zero, z]])
+}
+
 /// Computes the roots at deformation gradients `f`, entry `3 c + r` for (r, c).
 #[inline(always)]
 pub(crate) fn positive_roots(law: Hyperelastic, f: &[Lane; 9]) -> Roots {
@@ -89,11 +112,12 @@ pub(crate) fn positive_roots(law: Hyperelastic, f: &[Lane; 9]) -> Roots {
     let s = [dot(&u[0], &image[0]), dot(&u[1], &image[1]), dot(&u[2], &image[2])];
 
     let PrincipalTangent { stretch, turn, shear } = law.principal_tangent(s);
-    let mut rows = [[zero; 9]; 9];
+    let (mut rows, mut sizes) = ([[zero; 9]; 9], [zero; 9]);
     let mut smallest = turn[0];
     for (k, i, j) in [(0, 1, 2), (1, 2, 0), (2, 0, 1)] {
         let (ij, ji) = (outer(&u[i], &v[j]), outer(&u[j], &v[i]));
         let (t, h) = ((0.5 * turn[k]).max(0.0).sqrt(), (0.5 * shear[k]).max(0.0).sqrt());
+        (sizes[3 + k], sizes[6 + k]) = (t, h);
         for e in 0..9 {
             rows[3 + k][e] = t * (ij[e] - ji[e]);
             rows[6 + k][e] = h * (ij[e] + ji[e]);
@@ -101,16 +125,26 @@ pub(crate) fn positive_roots(law: Hyperelastic, f: &[Lane; 9]) -> Roots {
         smallest = turn[k].if_less(smallest, turn[k], smallest);
         smallest = shear[k].if_less(smallest, shear[k], smallest);
     }
-    let (values, vectors) = eigen(stretch);
     let own = [outer(&u[0], &v[0]), outer(&u[1], &v[1]), outer(&u[2], &v[2])];
-    for k in 0..3 {
-        let w = scaled(values[k].max(0.0).sqrt(), &vectors[k]);
+    let (roots, values) = match cholesky(&stretch) {
+        Some(roots) => (roots, [one; 3]),
+        None => {
+            let (values, vectors) = eigen(stretch);
+            let mut roots = vectors;
+            for k in 0..3 {
+                roots[k] = scaled(values[k].max(0.0).sqrt(), &vectors[k]);
+            }
+            (roots, values)
+        }
+    };
+    for (k, w) in roots.iter().enumerate() {
+        sizes[k] = values[k].max(0.0);
         for e in 0..9 {
             rows[k][e] = w[0] * own[0][e] + w[1] * own[1][e] + w[2] * own[2][e];
         }
         smallest = values[k].if_less(smallest, values[k], smallest);
     }
-    Roots { rows, least: smallest }
+    Roots { rows, sizes, least: smallest }
 }
 
 /// Returns the tangent of a law at a displacement gradient with its negative eigenvalues raised to
