@@ -1,5 +1,5 @@
-//! Nonlinear static solution of an anchored body under loads and prescribed displacements: the
-//! reference for the force in the hand.
+//! Nonlinear static solution of a body under loads and prescribed displacements: the reference for
+//! the force in the hand.
 //!
 //! The method is total Lagrangian finite elements with a hyperelastic [`Material`] whose moduli are
 //! those of the bake (J. Bonet and R. D. Wood, *Nonlinear Continuum Mechanics for Finite Element
@@ -35,6 +35,9 @@ const ROUNDS: usize = 100;
 
 /// Residual force, as a fraction of the load, at which an increment has converged.
 const TOLERANCE: f64 = 1e-8;
+
+/// Share by which the diagonal of a free body's tangent is raised.
+const LOOSE: f64 = 1e-8;
 
 /// Smallest increment, as a fraction of the whole load. Below it the solver gives up, because the
 /// body has no stable shape there.
@@ -98,13 +101,18 @@ pub struct Deflection {
     pub residual: f64,
 }
 
-/// Solves for the shape of an anchored body at rest under loads.
+/// Solves for the shape of an anchored body, or of a free one between held patches, at rest under
+/// loads.
+///
+/// What the held patches leave free of a free body's rigid motion, such as the turn about the line
+/// through two of them, stays as it is found.
 ///
 /// # Errors
 /// Returns the errors of [`bake`](crate::bake()) for the mesh, the material and the anchors.
 /// Returns [`BakeError::Parameter`] for a Poisson ratio above 0.45 (the nodal pressure has no
-/// nonlinear form here), for a body without anchors, for held patches that overlap so far that they
-/// cannot be told apart, and when no stable shape is found ("load").
+/// nonlinear form here), for a body without anchors that bears other loads than held patches, for
+/// held patches that overlap so far that they cannot be told apart, and when no stable shape is
+/// found ("load").
 pub fn deflect(
     mesh: &TetMesh,
     config: &BakeConfig,
@@ -116,8 +124,9 @@ pub fn deflect(
     if config.poisson > 0.45 {
         return refuse("Poisson ratio", "at most 0.45 for a nonlinear solution", config.poisson);
     }
-    if config.is_free() {
-        return refuse("anchors", "at least one for a nonlinear solution", 0.0);
+    let free = config.is_free();
+    if free && (loads.prescribed.is_empty() || !loads.forces.is_empty() || loads.gravity != [0.0; 3]) {
+        return refuse("anchors", "at least one, or held patches and no other load", 0.0);
     }
     if loads.prescribed.len() > 64 {
         return refuse("held patches", "at most 64", loads.prescribed.len() as f64);
@@ -159,6 +168,7 @@ pub fn deflect(
     let problem = Problem {
         continuum: Continuum { fe: &fe, law: material.with(lame.lambda, lame.mu), number: &number },
         ordered: &ordered,
+        free,
         symbolic: Symbolic::new(&ordered),
         load,
         pinned,
@@ -271,6 +281,8 @@ struct Equilibrium {
 struct Problem<'a> {
     continuum: Continuum<'a>,
     ordered: &'a crate::fem::Lists,
+    /// Whether the body has no anchors.
+    free: bool,
     symbolic: Symbolic,
     load: Vec<f64>,
     pinned: Vec<Places>,
@@ -447,6 +459,14 @@ impl Problem<'_> {
                         }
                     }
                 }
+            }
+        }
+        if self.free {
+            // The tangent of a free body has no inverse. This only changes the way of the rounds:
+            // it has no part in the forces that balance at the end.
+            for row in 0..out.nodes() as u32 {
+                let at = out.position(row, row);
+                (0..3).for_each(|axis| out.stiffness[9 * at + 4 * axis] *= 1.0 + LOOSE);
             }
         }
         (out, self.continuum.inner_forces(u))

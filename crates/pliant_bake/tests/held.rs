@@ -395,3 +395,53 @@ fn shapes_that_replace_others_leave_the_motion_as_it_is() {
     assert!(gone.v.iter().zip(&before.v).all(|(v, old)| v.abs() <= old.abs() + 1e-12));
     assert!(body.energy().is_finite() && gone.a.iter().all(|a| a.is_finite()));
 }
+
+#[test]
+fn a_body_of_which_one_of_two_hands_lets_go_gains_little_and_only_with_its_new_shapes() {
+    let free = BakeConfig { anchors: Vec::new(), ..config() };
+    let models = [model(&slender(), &config()), model(&slender(), &free)];
+    // Whether the body is free, places and ways of the hand that stays and of the one that goes.
+    type Row = (&'static str, usize, [Vector; 2], [Vector; 2]);
+    let rows: [Row; 4] = [
+        ("torn", 0, [[1.0, 0.1, 0.1], [0.5, 0.1, 0.05]], [[0.7, 0.0, 0.0], [-0.3, 0.2, 0.0]]),
+        ("pressed", 0, [[1.0, 0.1, 0.1], [0.5, 0.1, 0.05]], [[-0.5, 0.0, 0.0], [0.0, -0.3, 0.0]]),
+        ("sheared", 0, [[0.5, 0.1, 0.05], [1.0, 0.1, 0.1]], [[0.0, -0.3, 0.0], [-0.2, 0.6, 0.0]]),
+        ("free, torn", 1, [[0.0, 0.05, 0.1], [1.0, 0.05, 0.1]], [[-0.35, 0.0, 0.0], [0.35, 0.2, 0.0]]),
+    ];
+    for (name, which, places, ways) in rows {
+        let model = &models[which];
+        for rate in [60.0] {
+            let mut body = reduced(model, 1.0 / rate, 1.0);
+            let grabs = [0, 1].map(|i| {
+                let patch = Patch::around(model.surface(), vertex(model, places[i]), 0.05).unwrap();
+                let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+                (grab, ways[i])
+            });
+            lead_with(&mut body, &grabs, true);
+            assert!(body.held_shapes().is_some());
+            // What the springs of the hand and of its patch store is given back too.
+            let stored = |body: &Body| {
+                let (force, c) =
+                    (body.mean_reaction(grabs[0].0).unwrap(), body.compliance(grabs[0].0).unwrap());
+                let along = |i: usize| (0..3).map(|j| force[i] * c[i][j] * force[j]).sum::<f64>();
+                body.energy() + 0.5 * (0..3).map(along).sum::<f64>()
+            };
+            let before = stored(&body);
+            body.release(grabs[1].0);
+            let mut most = stored(&body);
+            let mut at_once = 0.0;
+            for i in 0..(3.0 * rate) as usize {
+                body.make_held_shapes().unwrap();
+                if i == 0 {
+                    at_once = stored(&body);
+                }
+                most = most.max(stored(&body));
+                body.step().unwrap();
+                most = most.max(stored(&body));
+            }
+            println!(
+                "{name} at {rate} Hz: {before:.4} J, with new shapes {at_once:.4}, then at most {most:.4}"
+            );
+        }
+    }
+}

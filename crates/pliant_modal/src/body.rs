@@ -529,12 +529,21 @@ impl Body {
     /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J.
     ///
     /// Potential energy in gravity is not included. Where the material relaxes, both springs of
-    /// each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`.
+    /// each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`. With reduced elasticity
+    /// the spring that relaxes counts as one of the stiffness at rest, which its force stretches.
     pub fn energy(&self) -> f64 {
         let frame = if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 };
         if self.kernel.is_reduced() {
             let kinetic: f64 = self.state.v.iter().map(|v| 0.5 * v * v).sum();
-            return kinetic + self.kernel.elastic_energy(&self.state) + frame;
+            let Some(relaxation) = self.config.settings.relaxation else {
+                return kinetic + self.kernel.elastic_energy(&self.state) + frame;
+            };
+            let mut force = vec![0.0; self.mode_count()];
+            self.kernel.elastic_force(&self.state, &mut force);
+            let over = force.iter().zip(&self.state.z).zip(self.omega());
+            let over: f64 = over.map(|((force, z), omega)| (force / omega - omega * z).powi(2)).sum();
+            let long = (1.0 - relaxation.ratio) * self.kernel.elastic_energy(&self.state);
+            return kinetic + long + 0.5 * relaxation.ratio * over + frame;
         }
         let ratio = self.config.settings.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())

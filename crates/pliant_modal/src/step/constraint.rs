@@ -174,6 +174,30 @@ impl ViscoelasticPatch {
         self.ratio * self.carry * viscoelastic
     }
 
+    /// Force (N, body axes) to which the hand's past has relaxed a patch: `y` with
+    /// `time y' = pull - (1 - ratio) y`. The viscoelastic state is the baked residual flexibility
+    /// under it.
+    pub(crate) fn relaxed_force(&self, hand: &Hand) -> Vector3<f64> {
+        if self.ratio == 0.0 || hand.viscoelastic == Vector3::zeros() {
+            return Vector3::zeros();
+        }
+        let inverse = (self.softness * hand.patch.residual()).try_inverse();
+        let force = inverse.map_or_else(Vector3::zeros, |inverse| inverse * hand.viscoelastic);
+        if force.iter().all(|x| x.is_finite()) { force } else { Vector3::zeros() }
+    }
+
+    /// Part of an elastic force that its branch takes off for each unit of
+    /// [`ViscoelasticPatch::relaxed_force`].
+    pub(crate) fn ratio(&self) -> f64 {
+        self.ratio
+    }
+
+    /// Displacement of a patch of reduced elasticity, whose residual flexibility is `residual`, in
+    /// a step that is due to earlier forces alone, m.
+    pub(crate) fn creep_of(&self, hand: &Hand, residual: &Matrix3<f64>) -> Vector3<f64> {
+        self.ratio * self.carry * self.softness * (residual * self.relaxed_force(hand))
+    }
+
     /// Returns the viscoelastic state after a step under a force `pull` (N, body axes).
     pub(crate) fn step(&self, hand: &Hand, pull: &Vector3<f64>) -> Vector3<f64> {
         if hand.config().is_rigid() {

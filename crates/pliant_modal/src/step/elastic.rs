@@ -15,6 +15,13 @@
 //! work of hands and loads, is taken from the velocities.
 
 //!
+//! Where the material relaxes ([`Relaxation`]), the force is `F - ratio y` with `F = dU/dq` and
+//! `time y' = F - y`: the standard linear solid for the force of each coordinate (J. C. Simo, *On a
+//! fully three-dimensional finite-strain viscoelastic damage model*, Comput. Methods Appl. Mech.
+//! Eng. 60, 1987, has it for the stress). With `F` linear in time over a step, `y1` is a weighted
+//! sum of `y0`, `F0` and `F1`, so that the end of the step has a share of `F1` and a constant. For
+//! linear elasticity this is passive at any step. The state's `z` is `y / omega^2`.
+//!
 //! The columns of held patches ([`HeldShapes`]) come before the modal coordinates in all arrays
 //! here. They have no mass: their response is that of their stiffness at rest.
 
@@ -24,7 +31,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::{HeldPatch, State, modes::Modes, patch::Six};
 use crate::{
-    HeldShapes, ModalModel,
+    HeldShapes, ModalModel, Relaxation,
     nonlinear::{Cholesky, ElasticEnergy},
     simd::dot,
 };
@@ -43,8 +50,10 @@ pub(crate) struct ElasticStep {
     response: Vec<[f64; 3]>,
     /// The share `t` of the force at the end of this step.
     share: f64,
-    /// The remainder `g` at the beginning of the step, kg^1/2 m/s^2.
+    /// What does not change with the end of the step: the remainder `g` at its beginning times its
+    /// share, and what an earlier force leaves at the end, kg^1/2 m/s^2.
     start: Vec<f64>,
+    relaxing: Option<Relaxing>,
     cholesky: Cholesky,
     /// Coordinates at which the energy is linearized, kg^1/2 m.
     q: Vec<f64>,
@@ -62,6 +71,17 @@ pub(crate) struct ElasticStep {
     far: f64,
     /// Elastic energy of the way of the round before, J.
     last: f64,
+}
+
+/// What a step of a relaxing material needs.
+#[derive(Debug, Clone)]
+struct Relaxing {
+    ratio: f64,
+    /// Weights of `y0`, `F0` and `F1` in `y1`.
+    weights: [f64; 3],
+    /// The relaxed force `y` and the elastic force `F` at the beginning of the step.
+    relaxed: Vec<f64>,
+    begun: Vec<f64>,
 }
 
 /// Elastic energy of a way that counts as far, as a share of Young's modulus times the volume: a
@@ -85,6 +105,7 @@ impl ElasticStep {
         model: &ModalModel,
         modes: &Modes,
         scale: f64,
+        relaxation: Option<Relaxation>,
         h: f64,
         shapes: Option<Arc<HeldShapes>>,
     ) -> Option<Self> {
@@ -105,6 +126,12 @@ impl ElasticStep {
         let mut response = vec![[0.0; 3]; count];
         response[..columns].fill([1.0 / scale, 0.0, 0.0]);
         let share = 0.5;
+        let relaxing = relaxation.map(|relaxation| Relaxing {
+            ratio: relaxation.ratio,
+            weights: relaxation.linear_weights(h),
+            relaxed: way.clone(),
+            begun: way.clone(),
+        });
         Some(Self {
             energy,
             shapes,
@@ -115,6 +142,7 @@ impl ElasticStep {
             response,
             share,
             start,
+            relaxing,
             cholesky,
             q,
             begun,
@@ -222,13 +250,15 @@ impl ElasticStep {
         state.s.extend(self.q[..columns].iter().map(|s| if s.is_finite() { *s } else { 0.0 }));
     }
 
-    /// Takes the elastic energy beyond `most` (J) from a state without columns: from its
-    /// velocities, and where these do not suffice from its coordinates, along the force over the
-    /// stiffness at rest. Its accelerations follow from both.
+    /// Number of columns of held patches.
+    pub(crate) fn columns(&self) -> usize {
+        self.columns
+    }
+
+    /// Takes the elastic energy beyond `most` (J) from a state: from its velocities, and where
+    /// these do not suffice from its coordinates, the stiff ones first. Its accelerations follow
+    /// from both.
     pub(crate) fn lower(&mut self, most: f64, state: &mut State) {
-        if self.columns > 0 {
-            return;
-        }
         let mut resisted = self.resisted(state);
         self.lower_energy(most, state);
         for (before, after) in resisted.iter_mut().zip(self.resisted(state)) {
@@ -237,19 +267,24 @@ impl ElasticStep {
         state.a.iter_mut().zip(resisted).for_each(|(a, changed)| *a += changed);
     }
 
-    /// Elastic and damping force of a state without columns, against its motion.
-    fn resisted(&mut self, state: &State) -> Vec<f64> {
-        self.energy.force_at(&state.q, &mut self.way);
-        let damping = self.damping.iter().zip(&state.v).map(|(c, v)| c * v);
-        self.way.iter().zip(damping).map(|(force, damping)| force + damping).collect()
+    /// Elastic and damping force of a state, against its motion.
+    fn resisted(&self, state: &State) -> Vec<f64> {
+        let mut out = vec![0.0; state.q.len()];
+        self.force_at(state, &mut out);
+        let damping = self.damping.iter().zip(&state.v);
+        out.iter_mut().zip(damping).for_each(|(out, (c, v))| *out += c * v);
+        out
     }
 
     fn lower_energy(&mut self, most: f64, state: &mut State) {
-        /// Maximum number of steps along the force, each of which ends beyond the goal where the
-        /// energy is linear.
-        const STEPS: usize = 16;
-        const BEYOND: f64 = 1.05;
-        let mut excess = self.energy.energy(&state.q) - most;
+        /// Largest number of rounds, and of halvings of a way that goes too far.
+        const ROUNDS: usize = 12;
+        const BISECTIONS: usize = 24;
+        let n = self.q.len();
+        let mut all = self.joined(state);
+        let mut begun = all.clone();
+        let mut now = self.energy.energy(&all);
+        let excess = now - most;
         if excess.is_nan() || excess <= 0.0 {
             return;
         }
@@ -257,27 +292,71 @@ impl ElasticStep {
         let left = if kinetic > excess { (1.0 - excess / kinetic).sqrt() } else { 0.0 };
         state.v.iter_mut().for_each(|v| *v *= left);
         let most = most + kinetic.min(excess);
-        for _ in 0..STEPS {
-            excess = self.energy.energy(&state.q) - most;
-            if excess.is_nan() || excess <= 0.0 {
-                return;
+        let mut factor = Cholesky::new(n);
+        for _ in 0..ROUNDS {
+            if now.is_nan() || now <= most {
+                break;
             }
-            self.energy.force_at(&state.q, &mut self.way);
-            let pairs = || self.way.iter().zip(&self.omega2);
-            let slope: f64 = pairs().map(|(force, omega2)| force * force / omega2).sum();
-            if slope.is_nan() || slope <= 0.0 {
-                return;
+            // The stiffness at rest beside the tangent: stiff directions go to where they rest,
+            // soft ones half of the way.
+            self.energy.linearize(&all);
+            for (i, (row, omega2)) in factor.matrix().chunks_exact_mut(n).zip(&self.omega2).enumerate() {
+                self.energy.tangent_row(i, &mut row[i..]);
+                row[i] += omega2;
             }
-            let share = BEYOND * excess / slope;
-            for (q, (force, omega2)) in state.q.iter_mut().zip(pairs()) {
-                *q -= share * force / omega2;
+            factor.factor();
+            let mut way: Vec<f64> = self.energy.force().iter().map(|force| -force).collect();
+            factor.solve(&mut way);
+            begun.copy_from_slice(&all);
+            let place = |all: &mut [f64], share: f64| {
+                for ((q, begun), way) in all.iter_mut().zip(&begun).zip(&way) {
+                    *q = begun + share * way;
+                }
+            };
+            // The shortest way that suffices, or else the best.
+            let (mut best, mut low, mut high) = ((now, 0.0), 0.0, 1.0);
+            for i in 0..BISECTIONS {
+                let share = if i == 0 { 1.0 } else { 0.5 * (low + high) };
+                place(&mut all, share);
+                let there = self.energy.energy(&all);
+                if there <= most {
+                    (best, high) = ((there, share), share);
+                } else {
+                    if there < best.0 && best.0 > most {
+                        best = (there, share);
+                    }
+                    if best.0 <= most {
+                        low = share;
+                    } else if there < now {
+                        break;
+                    } else {
+                        high = share;
+                    }
+                }
+            }
+            place(&mut all, best.1);
+            now = best.0;
+            if best.1 == 0.0 {
+                break;
             }
         }
+        let (columns, modal) = all.split_at(self.columns);
+        state.s.clear();
+        state.s.extend_from_slice(columns);
+        state.q.copy_from_slice(modal);
     }
 
     /// Begins a step from `before`, with the step under the loads alone in `after`, and linearizes
-    /// at its beginning. `load` is the modal force of the loads.
-    pub(crate) fn begin(&mut self, before: &State, modes: &Modes, load: &[f64], after: &mut State) {
+    /// at its beginning. `load` is the modal force of the loads, and `relaxed` has the forces (N,
+    /// body axes) to which the columns of the hands' patches have relaxed.
+    pub(crate) fn begin<'a>(
+        &mut self,
+        before: &State,
+        modes: &Modes,
+        load: &[f64],
+        relaxed: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>,
+        after: &mut State,
+    ) {
         join(self.columns, before, &mut self.q);
         self.begun.copy_from_slice(&self.q);
         self.energy.linearize(&self.q);
@@ -306,6 +385,30 @@ impl ElasticStep {
         self.share = 0.5 + 0.5 * stiffest.clamp(0.0, 1.0);
         self.unforced[columns..].copy_from_slice(&after.q);
         self.last = f64::INFINITY;
+        let t = self.share;
+        self.start.iter_mut().for_each(|start| *start *= 1.0 - t);
+        let Some(relaxing) = &mut self.relaxing else { return };
+        relaxing.begun.copy_from_slice(self.energy.force());
+        let (own, modal) = relaxing.relaxed.split_at_mut(columns);
+        own.fill(0.0);
+        for (patch, force) in relaxed {
+            let Some(rows) = self.shapes.as_ref().and_then(|shapes| shapes.rows(patch)) else { continue };
+            for (row, force) in rows.iter().zip(force.iter()) {
+                own.iter_mut().zip(row).for_each(|(own, row)| *own += force * row);
+            }
+        }
+        for ((y, z), omega2) in modal.iter_mut().zip(&before.z).zip(&self.omega2[columns..]) {
+            *y = omega2 * z;
+        }
+        let (ratio, [keep, old, _]) = (relaxing.ratio, relaxing.weights);
+        for ((start, y), force) in self.start.iter_mut().zip(&relaxing.relaxed).zip(&relaxing.begun) {
+            *start -= ratio * ((1.0 - t) * y + t * (keep * y + old * force));
+        }
+    }
+
+    /// Share of the elastic force at the end of a step that has not relaxed within it.
+    fn left(&self) -> f64 {
+        self.relaxing.as_ref().map_or(1.0, |relaxing| 1.0 - relaxing.ratio * relaxing.weights[2])
     }
 
     /// Solves the next round without hands. `First`: with the tangent of [`ElasticStep::begin`].
@@ -319,12 +422,10 @@ impl ElasticStep {
             self.factor();
             self.rows.clear();
         }
-        let t = self.share;
+        let (t, left) = (self.share, self.left());
         for (i, out) in self.free.iter_mut().enumerate() {
-            let remainder = self.energy.force()[i] - self.omega2[i] * self.q[i];
-            *out = (self.q[i] - self.unforced[i]) / self.response[i][0]
-                + t * remainder
-                + (1.0 - t) * self.start[i];
+            let remainder = left * self.energy.force()[i] - self.omega2[i] * self.q[i];
+            *out = (self.q[i] - self.unforced[i]) / self.response[i][0] + t * remainder + self.start[i];
         }
         self.cholesky.solve(&mut self.free);
         for (out, q) in self.free.iter_mut().zip(&self.q) {
@@ -333,12 +434,12 @@ impl ElasticStep {
     }
 
     fn factor(&mut self) {
-        let (n, t) = (self.q.len(), self.share);
+        let (n, t, left) = (self.q.len(), self.share, self.left());
         let matrix = self.cholesky.matrix();
         for (i, (omega2, response)) in self.omega2.iter().zip(&self.response).enumerate() {
             let row = &mut matrix[i * n + i..(i + 1) * n];
             self.energy.tangent_row(i, row);
-            row.iter_mut().for_each(|x| *x *= t);
+            row.iter_mut().for_each(|x| *x *= t * left);
             row[0] += 1.0 / response[0] - t * omega2;
         }
         self.cholesky.factor();
@@ -446,7 +547,7 @@ impl ElasticStep {
         for (i, way) in self.way.iter().enumerate() {
             let inverse = 1.0 / self.response[i][0];
             let straight = inverse * (self.q[i] - self.unforced[i]) - t * self.omega2[i] * self.q[i];
-            slope += (straight + (1.0 - t) * self.start[i]) * way;
+            slope += (straight + self.start[i]) * way;
             bend += 0.5 * (inverse - t * self.omega2[i]) * way * way;
         }
         let before = self.energy.energy(&self.q);
@@ -455,7 +556,7 @@ impl ElasticStep {
             for ((out, q), way) in self.free.iter_mut().zip(&self.q).zip(&self.way) {
                 *out = q + share * way;
             }
-            let change = t * (self.energy.energy(&self.free) - before);
+            let change = t * self.left() * (self.energy.energy(&self.free) - before);
             if change + share * (slope + share * bend) <= 0.0 {
                 break;
             }
@@ -480,10 +581,26 @@ impl ElasticStep {
     /// loads. Where the elasticity softens within a long way, it would: the velocities then give it
     /// back.
     pub(crate) fn finish(&mut self, before: &State, supplied: f64, force: &mut [f64], state: &mut State) {
+        let mut released = 0.0;
+        if let Some(relaxing) = &mut self.relaxing {
+            self.energy.compute_force(&self.q);
+            let (ratio, [keep, old, new], t) = (relaxing.ratio, relaxing.weights, self.share);
+            let ends = self.energy.force().iter().zip(&relaxing.begun);
+            let moved = self.q.iter().zip(&self.begun).map(|(q, begun)| q - begun);
+            for ((y, (force, begun)), moved) in relaxing.relaxed.iter_mut().zip(ends).zip(moved) {
+                let end = keep * *y + old * begun + new * force;
+                released += ratio * ((1.0 - t) * *y + t * end) * moved;
+                *y = end;
+            }
+            let ends = relaxing.relaxed[self.columns..].iter().zip(&self.omega2[self.columns..]);
+            for (z, (y, omega2)) in state.z.iter_mut().zip(ends) {
+                *z = y / omega2.max(f64::MIN_POSITIVE);
+            }
+        }
         let (columns, modal) = self.q.split_at(self.columns);
         state.s.resize(columns.len(), 0.0);
         state.s.copy_from_slice(columns);
-        let (mut way, mut work, mut kinetic) = (0.0, supplied, [0.0; 2]);
+        let (mut way, mut work, mut kinetic) = (0.0, supplied + released, [0.0; 2]);
         for ((now, begun), omega2) in columns.iter().zip(&self.begun).zip(&self.omega2) {
             way += 0.5 * omega2 * (now - begun) * (now - begun);
         }

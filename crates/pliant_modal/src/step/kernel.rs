@@ -160,9 +160,9 @@ fn elastic(
     h: f64,
     shapes: Option<Arc<HeldShapes>>,
 ) -> Option<ElasticStep> {
-    let scale = settings.stiffness_scale;
+    let (scale, relaxation) = (settings.stiffness_scale, settings.relaxation);
     if settings.is_reduced(model) && modes.count() > 0 {
-        ElasticStep::new(model, modes, scale, h, shapes)
+        ElasticStep::new(model, modes, scale, relaxation, h, shapes)
     } else {
         None
     }
@@ -248,7 +248,10 @@ impl Kernel {
             return Err(StepError::OtherModel);
         }
         self.check_lengths(state)?;
-        let before = self.held_shapes().is_some().then(|| self.elastic_energy(state));
+        // Only a state with the old columns loses them.
+        let before = self.elastic.as_ref().filter(|elastic| elastic.shapes().is_some());
+        let before = before.filter(|elastic| state.s.len() == elastic.columns());
+        let before = before.map(|elastic| elastic.energy(state));
         state.s.clear();
         if self.elastic.is_none() {
             return Ok(());
@@ -268,7 +271,10 @@ impl Kernel {
     /// This finds the columns of a state that came from elsewhere, such as a network.
     pub fn equilibrate_columns(&mut self, state: &mut State, hands: &[Hand]) {
         let back = state.frame.rotation().inverse();
-        let pulls = hands.iter().map(|hand| (&*hand.patch, back * hand.mean));
+        let pulls = hands.iter().map(|hand| {
+            let relaxed = self.creep.ratio() * self.creep.relaxed_force(hand);
+            (&*hand.patch, back * hand.mean + relaxed)
+        });
         if let Some(elastic) = self.elastic.as_mut().filter(|elastic| elastic.shapes().is_some()) {
             elastic.equilibrate_columns(state, pulls);
         }
@@ -794,7 +800,8 @@ impl Kernel {
         }
         let beyond = self.settings.extrapolation(&self.model, state.modes(), hands.len());
         if let Some(elastic) = &mut self.elastic {
-            elastic.begin(&self.before, &self.modes, &self.force, state);
+            let relaxed = hands.iter().map(|hand| (&*hand.patch, self.creep.relaxed_force(hand)));
+            elastic.begin(&self.before, &self.modes, &self.force, relaxed, state);
         }
         self.solving.clear();
         for hand in hands {
@@ -810,7 +817,15 @@ impl Kernel {
                 solving.target = target;
                 // Targets may teleport, and their velocity is then meaningless.
                 solving.lead = (config.relaxation * velocity).cap_magnitude(2.0 * self.model.size());
-                solving.creep_displacement = self.creep.creep_displacement(&hand.viscoelastic);
+                solving.creep_displacement = match &self.elastic {
+                    Some(elastic) => {
+                        let turn = hand.patch.rotation(&self.before.q);
+                        let own = elastic.shapes().and_then(|shapes| shapes.residual(&hand.patch));
+                        let own = own.unwrap_or_else(|| hand.patch.residual());
+                        self.creep.creep_of(hand, &(turn * own * turn.transpose()))
+                    }
+                    None => self.creep.creep_displacement(&hand.viscoelastic),
+                };
                 solving.relaxation = config.relaxation;
                 if config.relaxation > 0.0 {
                     solving.speed = hand.patch.rows().reduce(&self.velocity, warp);

@@ -20,6 +20,8 @@ pub(crate) struct Modes {
     /// Whether the step also uses the old acceleration and force.
     memory: bool,
     viscous: Option<Viscous>,
+    /// Whether the material is viscoelastic. Reduced elasticity then has no `viscous`.
+    relaxes: bool,
 }
 
 /// Additional coefficients of a viscoelastic material, see [`crate::ViscoelasticCoefficients`].
@@ -46,7 +48,7 @@ impl Modes {
         let (mut made, mut branches) = (Vec::with_capacity(count), Vec::new());
         for (&omega, &c) in omega.iter().zip(&damping) {
             match settings.relaxation {
-                None if reduced => made.push(Coefficients::reduced(omega, c, h)?),
+                _ if reduced => made.push(Coefficients::reduced(omega, c, h)?),
                 None => made.push(Coefficients::new(settings.integrator, omega, c, h)?),
                 Some(relaxation) => {
                     let (one, viscoelastic) =
@@ -56,7 +58,7 @@ impl Modes {
                 }
             }
         }
-        let viscous = settings.relaxation.map(|_| Viscous {
+        let viscous = settings.relaxation.filter(|_| !reduced).map(|_| Viscous {
             onto: std::array::from_fn(|row| branches.iter().map(|f| f.onto[row]).collect()),
             free: std::array::from_fn(|column| branches.iter().map(|f| f.free[column]).collect()),
             carry: branches.iter().map(|f| f.carry).collect(),
@@ -72,6 +74,7 @@ impl Modes {
             damper: made.iter().map(|c| c.response[1].max(c.response[0] / h)).collect(),
             memory: settings.integrator != Integrator::Exact && !reduced,
             viscous,
+            relaxes: settings.relaxation.is_some(),
         })
     }
 
@@ -82,7 +85,7 @@ impl Modes {
 
     /// Whether the material is viscoelastic, so that a state has a `z`.
     pub(crate) fn is_viscous(&self) -> bool {
-        self.viscous.is_some()
+        self.relaxes
     }
 
     /// Steps all modes from `before` under a modal force and writes the result to `after`.

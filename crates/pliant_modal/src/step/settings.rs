@@ -73,7 +73,8 @@ pub struct StepSettings {
     /// Default: 1.
     pub stiffness_scale: f64,
     /// Parameters of a viscoelastic material: every mode, and the flexibility under every hand, is
-    /// a standard linear solid. Only for linear elasticity. Default: `None`, elastic.
+    /// a standard linear solid. With reduced elasticity the elastic force of each coordinate
+    /// relaxes. Default: `None`, elastic.
     pub relaxation: Option<Relaxation>,
 }
 
@@ -113,8 +114,6 @@ impl StepSettings {
             StepError::check("rho_inf", "0 to 1", (0.0..=1.0).contains(&rho_inf), rho_inf)?;
         }
         if let Some(relaxation) = &self.relaxation {
-            let linear = self.elasticity == Elasticity::Linear;
-            StepError::check("relaxation", "none with reduced elasticity", linear, relaxation.ratio)?;
             relaxation.check()?;
         }
         let beyond = self.gravity.iter().find(|x| x.is_nan() || x.abs() > 1e9);
