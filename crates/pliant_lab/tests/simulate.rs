@@ -62,11 +62,11 @@ fn peers_that_are_told_false_ticks_keep_what_must_hold() {
     }
 }
 
-/// In these the hand jumps, because its device stood still or was away. It was told of 1.34, 1.31
-/// and 1.42 times the largest true reaction.
+/// In these the hand jumps, because its device stood still or was away. It was told of 1.34, 1.31,
+/// 1.42 and 1.23 times the largest true reaction. In the last one it came back in three targets.
 #[test]
 fn a_hand_whose_device_was_away_is_told_of_no_more_than_the_body_gives() {
-    for seed in [516, 760, 958] {
+    for seed in [516, 760, 958, 2066] {
         run(&FaultKind::ALL, seed, 1);
     }
 }

@@ -14,10 +14,13 @@ use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets, che
 
 /// Interval at which an unchanged target is sent again.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
-/// A hand jumps when its way from one target to the next is farther than this share of the body's
-/// size, and farther than its longest way of late by this factor. The host eases such a jump, as a
+/// A hand jumps when its way over its last targets is farther than this share of the body's size,
+/// and farther than its longest ways before these by this factor. The host eases such a jump, as a
 /// [`HandPlayout`](crate::HandPlayout) does.
 const JUMP: [f64; 2] = [0.05, 1.5];
+/// Number of targets over which a hand may jump. A device that has been away does not always come
+/// back with one.
+const JUMP_TARGETS: usize = 3;
 /// Factor by which a way is forgotten from one target to the next.
 const FORGETTING: f64 = 0.98;
 /// Number of recent targets of a grab in each datagram.
@@ -28,6 +31,9 @@ pub(super) struct LocalGrab {
     pub(super) body: BodyId,
     /// The recent targets, newest last, at most three.
     targets: VecDeque<TargetEntry>,
+    /// For each of the last [`JUMP_TARGETS`] targets, newest last: the target before it, and the
+    /// longest way from one to the next until then, m.
+    before: VecDeque<(Vector3<f64>, f64)>,
     /// The last target, and the longest way from one to the next of late, m.
     last: Vector3<f64>,
     usual: f64,
@@ -40,6 +46,22 @@ impl LocalGrab {
     pub(super) fn due(&self, now: Duration) -> Option<Duration> {
         let due = if self.fresh { now } else { self.sent_at + TARGET_EVERY };
         (!self.targets.is_empty()).then_some(due)
+    }
+
+    /// Takes the next target. Returns the longest way over the last targets that is farther than
+    /// the hand has moved of late, m, or zero.
+    fn jumped(&mut self, target: Vector3<f64>) -> f64 {
+        let last = std::mem::replace(&mut self.last, target);
+        if self.before.len() >= JUMP_TARGETS {
+            self.before.pop_front();
+        }
+        self.before.push_back((last, self.usual));
+        self.usual = (target - last).norm().max(FORGETTING * self.usual);
+        let ways = self.before.iter().rev().zip(1..).map(|(&(from, usual), count)| {
+            let way = (target - from).norm();
+            if way > JUMP[1] * f64::from(count) * usual { way } else { 0.0 }
+        });
+        ways.fold(0.0, f64::max)
     }
 }
 
@@ -82,8 +104,8 @@ impl GuestSession {
             return Err(StreamError::Full { what: "grabs", limit });
         }
         let grab = next_free(&mut self.next_grab, |grab| !self.grabs.contains_key(&grab));
-        let (targets, last) = (VecDeque::new(), target.into());
-        let own = LocalGrab { body, targets, last, usual: 0.0, fresh: false, sent_at: now };
+        let (targets, before, last) = (VecDeque::new(), VecDeque::new(), target.into());
+        let own = LocalGrab { body, targets, before, last, usual: 0.0, fresh: false, sent_at: now };
         self.grabs.insert(grab, own);
         if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
             predicted.begin(grab, vertex, radius, target, hold);
@@ -110,12 +132,11 @@ impl GuestSession {
         own.targets.push_back(TargetEntry { grab, input: self.input, target });
         own.fresh = true;
         let target = Vector3::from(target);
-        let way = (target - std::mem::replace(&mut own.last, target)).norm();
-        let fastest = JUMP[1] * own.usual;
-        own.usual = way.max(FORGETTING * own.usual);
+        let far = own.jumped(target);
         let Some(body) = self.bodies.get_mut(&own.body) else { return Ok(()) };
-        if way > fastest && body.model().is_some_and(|model| way > JUMP[0] * model.size()) {
+        if body.model().is_some_and(|model| far > JUMP[0] * model.size()) {
             body.hitches.jump();
+            own.before.clear();
         }
         if let Some(predicted) = body.predicted.as_mut() {
             predicted.set(grab, target.into());
