@@ -16,7 +16,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use pliant_modal::{Frame, GrabConfig, Hand, HeldPlace, HeldShapes, Hold, Load, RigidMotion};
+use pliant_modal::{Frame, GrabConfig, Hand, HeldPlace, HeldShapes, Hold, Kernel, Load, RigidMotion};
 
 use super::{BodyCopy, HandState, VisualCopy};
 use crate::recovery::{Forecast, Receiver};
@@ -80,10 +80,15 @@ pub struct PredictedHand {
     push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
-    /// Finds the columns of held patches. The steps of the copy are made without them, because the
-    /// streamed loads are those that steps without them lack.
-    shaped: Option<Replica>,
-    /// The columns of held patches in the shown state, and scratch.
+    /// The own shapes of held patches that are taken with the next step.
+    next_shapes: Option<Option<Arc<HeldShapes>>>,
+    /// The kernel without shapes, where `replica` has some.
+    plain: Option<Kernel>,
+    /// The modal force that steps with shapes lack, and scratch.
+    load: Vec<f64>,
+    force: Vec<f64>,
+    /// The columns of held patches at the confirmed tick, in the shown state, and scratch.
+    confirmed_columns: Vec<f64>,
     columns: Vec<f64>,
     settled: State,
     /// The held patches and where they are in the shown state.
@@ -109,29 +114,64 @@ impl PredictedHand {
             push: (Vector3::zeros(), Vector3::zeros()),
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
-            shaped: None,
+            next_shapes: None,
+            plain: None,
+            load: Vec::new(),
+            force: Vec::new(),
+            confirmed_columns: Vec::new(),
             columns: Vec::new(),
             settled: State::default(),
             places: Vec::new(),
         }
     }
 
-    /// Sets the own shapes of the patches that hands hold on the body, for what is shown.
+    /// Sets the own shapes of the patches that hands hold on the body, from the next step on.
+    /// What that changes in the hands and in the shown state fades in.
     pub(crate) fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
+        self.next_shapes = Some(shapes);
+    }
+
+    /// Takes the shapes that were set.
+    fn take_shapes(&mut self) {
+        let Some(shapes) = self.next_shapes.take() else { return };
+        self.confirmed_columns.clear();
         self.columns.clear();
-        let kernel = self.replica.kernel();
-        let (model, settings) = (kernel.model().clone(), *kernel.settings());
-        let (modes, h) = (kernel.modes(), kernel.h());
-        self.shaped = shapes.and_then(|shapes| {
-            let mut shaped = Replica::new(model, settings, modes, h).ok()?;
-            shaped.set_held_shapes(Some(shapes));
-            Some(shaped)
-        });
+        self.replica.set_held_shapes(shapes);
+        if self.held_shapes().is_none() {
+            self.plain = None;
+        } else if self.plain.is_none() {
+            let kernel = self.replica.kernel();
+            let model = kernel.model().clone();
+            self.plain = Kernel::new(model, *kernel.settings(), kernel.modes(), kernel.h()).ok();
+        }
     }
 
     /// The own shapes of held patches that are used.
     pub(crate) fn held_shapes(&self) -> Option<&Arc<HeldShapes>> {
-        self.shaped.as_ref()?.kernel().held_shapes()
+        self.replica.kernel().held_shapes()
+    }
+
+    /// Finds the columns of held patches in a copy at the confirmed tick, and the load of steps
+    /// with them.
+    ///
+    /// The streamed load is what steps without columns lack, as receivers make them. Where the host
+    /// has columns, it is mostly the elastic force of these. Steps with columns lack as much less.
+    fn settle_columns(&mut self, copy: &mut BodyCopy, receiver: &Receiver) {
+        self.load.clear();
+        self.load.extend_from_slice(receiver.load());
+        let Some(plain) = &self.plain else {
+            copy.state.s.clear();
+            return;
+        };
+        copy.state.s.clone_from(&self.confirmed_columns);
+        let held = receiver.grabs().iter().map(|g| (g.vertex, g.radius, g.reaction));
+        self.replica.equilibrate_columns(&mut copy.state, held);
+        self.confirmed_columns.clone_from(&copy.state.s);
+        self.force.resize(self.load.len(), 0.0);
+        for (kernel, sign) in [(self.replica.kernel(), 1.0), (plain, -1.0)] {
+            kernel.elastic_force(&copy.state, &mut self.force);
+            self.load.iter_mut().zip(&self.force).for_each(|(load, force)| *load += sign * force);
+        }
     }
 
     /// The columns of held patches in the shown state.
@@ -168,11 +208,11 @@ impl PredictedHand {
         let own = self.grabs.iter().filter(|g| active && g.target.is_some());
         let own = own.map(|g| (g.vertex, g.radius, std::array::from_fn(|k| g.reaction[k] + g.offset[k])));
         let held: Vec<(u32, f64, [f64; 3])> = others.chain(own).collect();
-        if let Some(shaped) = &mut self.shaped {
-            shaped.equilibrate_columns(&mut self.settled, held.iter().copied());
+        if self.held_shapes().is_some() {
+            self.replica.equilibrate_columns(&mut self.settled, held.iter().copied());
             self.columns.clone_from(&self.settled.s);
         }
-        let replica = self.shaped.as_mut().unwrap_or(&mut self.replica);
+        let replica = &mut self.replica;
         let place = |&(vertex, radius, _): &(u32, f64, _)| replica.held_place(&self.settled, vertex, radius);
         self.places.extend(held.iter().filter_map(place));
     }
@@ -279,6 +319,7 @@ impl PredictedHand {
             if before > 0 || self.active {
                 self.fall_back(receiver);
             }
+            self.take_shapes();
             self.find_columns(receiver, user);
             self.tick = confirmed;
             return;
@@ -286,9 +327,13 @@ impl PredictedHand {
         if !self.active {
             self.active = true;
             self.lead = guess.min(REMEMBERED - 1);
+            self.take_shapes();
             self.take(receiver.visual());
-            replica::place(&mut self.copy.state, self.replica.model(), receiver.pose().as_ref());
-            self.copy.contacts = receiver.contacts().cloned().unwrap_or_default();
+            let mut copy = std::mem::take(&mut self.copy);
+            replica::place(&mut copy.state, self.replica.model(), receiver.pose().as_ref());
+            copy.contacts = receiver.contacts().cloned().unwrap_or_default();
+            self.settle_columns(&mut copy, receiver);
+            self.copy = copy;
             self.visual.state.clone_from(&self.copy.state);
             self.visual.clear();
         }
@@ -304,8 +349,10 @@ impl PredictedHand {
             g.would = expected.hand(key).map_or(g.reaction, |hand| (-hand.pull).into());
         }
 
+        self.take_shapes();
         let mut copy = std::mem::take(&mut self.copy);
         self.confirm(&mut copy, receiver, user, confirmed_frame);
+        self.settle_columns(&mut copy, receiver);
         for j in 1..=self.lead {
             self.one_step(&mut copy, receiver, user, j);
         }
@@ -418,7 +465,7 @@ impl PredictedHand {
             self.replica.hold_at(copy, key, (g.vertex, g.radius), target.into(), g.hold);
         }
         let (force, torque) = self.push;
-        let load = Load { modal: receiver.load(), force, torque, ..Load::default() };
+        let load = Load { modal: &self.load, force, torque, ..Load::default() };
         self.replica.step_held(copy, &load);
     }
 
