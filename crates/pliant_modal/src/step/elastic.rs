@@ -13,7 +13,6 @@
 //! turns by more than a radian within a step, `t` goes to 1 and the coordinates are stepped by
 //! backward Euler, which is calm at any stiffness. What energy a step would still add, beyond the
 //! work of hands and loads, is taken from the velocities.
-
 //!
 //! Where the material relaxes ([`Relaxation`]), the force is `F - ratio y` with `F = dU/dq` and
 //! `time y' = F - y`: the standard linear solid for the force of each coordinate (J. C. Simo, *On a
@@ -24,6 +23,8 @@
 //!
 //! The columns of held patches ([`HeldShapes`]) come before the modal coordinates in all arrays
 //! here. They have no mass: their response is that of their stiffness at rest.
+
+mod columns;
 
 use std::sync::Arc;
 
@@ -194,156 +195,9 @@ impl ElasticStep {
         self.rows.reserve(n.saturating_sub(self.rows.len()));
     }
 
-    /// Brings the columns to rest under the hands' forces (N, body axes), while the coordinates
-    /// stay where they are.
-    pub(crate) fn equilibrate_columns<'a>(
-        &mut self,
-        state: &mut State,
-        pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>,
-    ) {
-        /// Number of Newton rounds.
-        const ROUNDS: usize = 8;
-        let columns = self.columns;
-        let Some(shapes) = self.shapes.clone() else {
-            state.s.clear();
-            return;
-        };
-        join(columns, state, &mut self.q);
-        let mut load = vec![0.0; columns];
-        for (patch, pull) in pulls {
-            let Some(rows) = shapes.rows(patch) else { continue };
-            for (row, pull) in rows.iter().zip(pull.iter()) {
-                load.iter_mut().zip(row).for_each(|(load, u)| *load += pull * u);
-            }
-        }
-        let potential = |energy: &ElasticEnergy, q: &[f64]| {
-            energy.energy(q) - load.iter().zip(q).map(|(f, q)| f * q).sum::<f64>()
-        };
-        let mut factor = Cholesky::new(columns);
-        for _ in 0..ROUNDS {
-            self.energy.linearize(&self.q);
-            for (i, row) in factor.matrix().chunks_exact_mut(columns).enumerate() {
-                self.energy.tangent_row(i, &mut row[i..]);
-            }
-            factor.factor();
-            let missing = load.iter().zip(self.energy.force());
-            let mut way: Vec<f64> = missing.map(|(load, force)| load - force).collect();
-            factor.solve(&mut way);
-            // The columns have energy one half each at one.
-            let size: f64 = way.iter().map(|way| 0.5 * self.omega2[0] * way * way).sum();
-            let (before, old) = (potential(&self.energy, &self.q), self.q[..columns].to_vec());
-            let mut share = 1.0;
-            for _ in 0..HALVINGS {
-                for ((s, old), way) in self.q.iter_mut().zip(&old).zip(&way) {
-                    *s = old + share * way;
-                }
-                if potential(&self.energy, &self.q) <= before {
-                    break;
-                }
-                share *= 0.5;
-            }
-            if size <= NOTHING * self.far {
-                break;
-            }
-        }
-        state.s.clear();
-        state.s.extend(self.q[..columns].iter().map(|s| if s.is_finite() { *s } else { 0.0 }));
-    }
-
     /// Number of columns of held patches.
     pub(crate) fn columns(&self) -> usize {
         self.columns
-    }
-
-    /// Takes the elastic energy beyond `most` (J) from a state: from its velocities, and where
-    /// these do not suffice from its coordinates, the stiff ones first. Its accelerations follow
-    /// from both.
-    pub(crate) fn lower(&mut self, most: f64, state: &mut State) {
-        let mut resisted = self.resisted(state);
-        self.lower_energy(most, state);
-        for (before, after) in resisted.iter_mut().zip(self.resisted(state)) {
-            *before -= after;
-        }
-        state.a.iter_mut().zip(resisted).for_each(|(a, changed)| *a += changed);
-    }
-
-    /// Elastic and damping force of a state, against its motion.
-    fn resisted(&self, state: &State) -> Vec<f64> {
-        let mut out = vec![0.0; state.q.len()];
-        self.force_at(state, &mut out);
-        let damping = self.damping.iter().zip(&state.v);
-        out.iter_mut().zip(damping).for_each(|(out, (c, v))| *out += c * v);
-        out
-    }
-
-    fn lower_energy(&mut self, most: f64, state: &mut State) {
-        /// Largest number of rounds, and of halvings of a way that goes too far.
-        const ROUNDS: usize = 12;
-        const BISECTIONS: usize = 24;
-        let n = self.q.len();
-        let mut all = self.joined(state);
-        let mut begun = all.clone();
-        let mut now = self.energy.energy(&all);
-        let excess = now - most;
-        if excess.is_nan() || excess <= 0.0 {
-            return;
-        }
-        let kinetic: f64 = state.v.iter().map(|v| 0.5 * v * v).sum();
-        let left = if kinetic > excess { (1.0 - excess / kinetic).sqrt() } else { 0.0 };
-        state.v.iter_mut().for_each(|v| *v *= left);
-        let most = most + kinetic.min(excess);
-        let mut factor = Cholesky::new(n);
-        for _ in 0..ROUNDS {
-            if now.is_nan() || now <= most {
-                break;
-            }
-            // The stiffness at rest beside the tangent: stiff directions go to where they rest,
-            // soft ones half of the way.
-            self.energy.linearize(&all);
-            for (i, (row, omega2)) in factor.matrix().chunks_exact_mut(n).zip(&self.omega2).enumerate() {
-                self.energy.tangent_row(i, &mut row[i..]);
-                row[i] += omega2;
-            }
-            factor.factor();
-            let mut way: Vec<f64> = self.energy.force().iter().map(|force| -force).collect();
-            factor.solve(&mut way);
-            begun.copy_from_slice(&all);
-            let place = |all: &mut [f64], share: f64| {
-                for ((q, begun), way) in all.iter_mut().zip(&begun).zip(&way) {
-                    *q = begun + share * way;
-                }
-            };
-            // The shortest way that suffices, or else the best.
-            let (mut best, mut low, mut high) = ((now, 0.0), 0.0, 1.0);
-            for i in 0..BISECTIONS {
-                let share = if i == 0 { 1.0 } else { 0.5 * (low + high) };
-                place(&mut all, share);
-                let there = self.energy.energy(&all);
-                if there <= most {
-                    (best, high) = ((there, share), share);
-                } else {
-                    if there < best.0 && best.0 > most {
-                        best = (there, share);
-                    }
-                    if best.0 <= most {
-                        low = share;
-                    } else if there < now {
-                        break;
-                    } else {
-                        high = share;
-                    }
-                }
-            }
-            place(&mut all, best.1);
-            now = best.0;
-            if best.1 == 0.0 {
-                break;
-            }
-        }
-        let (columns, modal) = all.split_at(self.columns);
-        state.s.clear();
-        state.s.extend_from_slice(columns);
-        state.q.copy_from_slice(modal);
     }
 
     /// Begins a step from `before`, with the step under the loads alone in `after`, and linearizes

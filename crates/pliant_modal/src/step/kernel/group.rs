@@ -5,7 +5,12 @@
 //! computed again under the new forces. Where a body bends or turns within the step, this is
 //! repeated. Bodies at rest compute one step.
 
-use nalgebra::{Matrix3, Vector3};
+mod guard;
+mod record;
+
+use nalgebra::Vector3;
+
+use guard::gained;
 
 use super::{
     Kernel, points,
@@ -13,10 +18,8 @@ use super::{
 };
 use crate::{
     Probe, Rigid, StepError,
-    contact::{
-        Contact, ContactPoint, ContactReport, ContactSites, Contacts, Memory, Shape, Sixes, Touched, Touching,
-    },
-    step::{Frame, Hand, Load, State, StepReport},
+    contact::{ContactReport, ContactSites, Contacts, Shape, Sixes, Touching},
+    step::{Hand, Load, State, StepReport},
 };
 
 /// Largest number of times that a step is computed again with new forces, without hands or rigid
@@ -31,15 +34,8 @@ const BAND: f64 = 2e-3;
 const STILL: f64 = 1e-12;
 const ENOUGH: f64 = 1e-6;
 
-/// Violation of the laws beyond which bodies that have passed through each other are stopped, as a
-/// share of the size.
-const TORN: f64 = 0.05;
-
 /// Way of a body's sites up to which it is not found where they are, as a share of its size.
 const SLACK: f64 = 1e-3;
-
-/// Share of the kinetic and elastic energy that a step may gain of what contacts have lost before.
-const GIVEN_BACK: f64 = 1e-2;
 
 /// What a step changes of a body.
 pub(crate) struct Parts<'a> {
@@ -461,322 +457,6 @@ impl<P: Member> Group<'_, P> {
         let rigids = self.len() + self.held.len();
         for side in work.sides.iter().flatten().flatten().filter(|side| side.member >= rigids) {
             work.rows[side.rows..][..18].iter_mut().for_each(|x| *x *= scale);
-        }
-    }
-
-    /// Takes the energy that the step has gained from the velocities. Returns whether it had any.
-    ///
-    /// The work of the contacts is right to second order in the way of a step. Bodies that turn or
-    /// bend far within one step may still gain. Hands and loads do work of their own, and a
-    /// material that relaxes stores energy that is not counted here: such steps are not checked.
-    fn cap_energy(&mut self, work: &mut Touching) -> bool {
-        if !work.points.iter().any(|point| point.pushed[0] > 0.0) {
-            return false;
-        }
-        let (mut moving, mut gained, mut scale, mut lost, mut slow) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        // A probe does the work of a hand.
-        if work.points.iter().any(|point| point.probe.is_some() && point.pushed[0] > 0.0) {
-            return false;
-        }
-        // A rigid body keeps what it has been given, whatever becomes of the members.
-        let fixed = |point: &ContactPoint| point.far.is_none() && point.rigid.is_none();
-        let mut grounded = work.points.iter().any(|point| fixed(point) && point.pushed[0] > 0.0);
-        for member in 0..self.len() {
-            let View { kernel, state, hands, load, contacts } = self.view(member);
-            let other = Load { modal: load.modal, ..Load::default() } != load;
-            let loaded = other || load.modal.iter().any(|load| *load != 0.0);
-            if loaded || !hands.is_empty() || kernel.modes.is_viscous() || !state.is_finite() {
-                return false;
-            }
-            grounded |= !kernel.model.is_free();
-            let at_rest = |state: &State| kernel.elastic_energy(state) + kernel.potential_energy(state);
-            let (now, before) = (kernel.kinetic_energy(state), kernel.kinetic_energy(&kernel.before));
-            moving += now;
-            gained += now - before + at_rest(state) - at_rest(&kernel.before);
-            scale += now + before;
-            scale += kernel.elastic_energy(state) + kernel.elastic_energy(&kernel.before);
-            lost += contacts.lost;
-            let speed = points::RECOVERY_SPEED * kernel.model.size();
-            let gravity = Vector3::from(kernel.settings.gravity).norm();
-            slow += kernel.model.mass() * speed * (0.5 * speed + gravity * self.h);
-        }
-        let mut recovered = 0.0;
-        for point in &work.points {
-            let force = point.world_force();
-            let (now, before) = (point.stored(&force), point.stored(&point.before));
-            scale += now + before;
-            gained += now - before;
-            // What pushes a body out that was set into something.
-            let out = point.pushed[0] * (point.floor - point.gap).max(0.0);
-            if point.far.is_none() {
-                // What the obstacles supply.
-                gained -= force.dot(&point.carried) + out;
-            } else {
-                recovered += out;
-            }
-        }
-        // Between bodies it may cost what moves them at the speed of the recovery against gravity,
-        // and what was lost before pays for it first.
-        let recovered = recovered.min(slow);
-        gained -= recovered;
-        lost -= recovered.min(lost).max(0.0);
-        // A step may take back a little of what the steps before have lost: a rolling ball loses
-        // and gains in turn, and would slow down if only the gains were taken.
-        let allowed = lost.min(GIVEN_BACK * scale);
-        let mut lost = lost - gained.min(allowed);
-        if self.len() == 1 {
-            lost = lost.min(scale);
-        }
-        let lost = lost / self.len() as f64;
-        let gained = gained - allowed;
-        // Bodies that touch nothing else keep their common momentum.
-        let common = if grounded { Common::default() } else { Common::of(self, &|_| true) };
-        moving -= common.energy;
-        for member in 0..self.len() {
-            self.parts(member).contacts.lost = lost;
-        }
-        if gained > moving && gained > 1e-3 * scale {
-            // The velocities cannot pay for it. The bodies stop where the step began.
-            let (count, taken) = (self.len() as f64, self.stop(|_| true, grounded));
-            for member in 0..self.len() {
-                self.parts(member).contacts.lost += (taken + allowed) / count;
-            }
-            // What stopped the members stops a rigid body too, which would fall through them.
-            work.points.retain(|point| grounded && point.rigid.is_some());
-            true
-        } else if gained > 1e-12 * scale && moving > 0.0 {
-            let left = (1.0 - gained / moving).max(0.0).sqrt();
-            for member in 0..self.len() {
-                let Parts { kernel, state, .. } = self.parts(member);
-                common.slow(kernel, state, left);
-            }
-            true
-        } else {
-            false
-        }
-    }
-
-    /// Puts some members back to where the step began, with nothing but the rigid motion that has
-    /// their common momentum, or without any motion if they touch the ground. Returns the kinetic
-    /// energy that they lose, J.
-    fn stop(&mut self, stops: impl Fn(usize) -> bool, grounded: bool) -> f64 {
-        let mut before = 0.0;
-        for member in (0..self.len()).filter(|&member| stops(member)) {
-            let Parts { kernel, state, hands, contacts, .. } = self.parts(member);
-            state.clone_from(&kernel.before);
-            contacts.restore(hands);
-            before += kernel.kinetic_energy(state);
-        }
-        // The rigid motion with a momentum never has more energy than the bodies that have it.
-        let common = if grounded { Common::default() } else { Common::of(self, &stops) };
-        for member in (0..self.len()).filter(|&member| stops(member)) {
-            let Parts { kernel, state, .. } = self.parts(member);
-            common.slow(kernel, state, 0.0);
-            before -= kernel.kinetic_energy(state);
-        }
-        before
-    }
-
-    /// Stops the members that would pass through each other, because the laws could not be solved
-    /// for a hard impulse. Returns whether there are any.
-    fn stop_torn(&mut self, work: &mut Touching) -> bool {
-        let torn = |point: &ContactPoint| {
-            point.far.as_ref().filter(|far| far.passed && point.violation() > TORN * self.size).is_some()
-        };
-        if !work.points.iter().any(torn) {
-            return false;
-        }
-        let mut marks = std::mem::take(&mut work.marks);
-        marks.clear();
-        marks.resize(self.len(), 0);
-        let mut grounded = false;
-        for point in work.points.iter().filter(|point| torn(point)) {
-            for member in [Some(point.member), point.far.map(|far| far.member)].into_iter().flatten() {
-                marks[member] = 1;
-                grounded |= !self.view(member).kernel.model.is_free();
-            }
-        }
-        self.stop(|member| marks[member] == 1, grounded);
-        let stopped = |point: &ContactPoint| {
-            marks[point.member] == 1 || point.far.is_some_and(|far| marks[far.member] == 1)
-        };
-        work.points.retain(|point| !stopped(point));
-        work.marks = marks;
-        true
-    }
-
-    /// Stores what the next step needs and what users read.
-    fn end(&mut self, work: &mut Touching, theta: f64, report: &ContactReport) {
-        for member in 0..self.len() {
-            let contacts = self.parts(member).contacts;
-            contacts.memory.clear();
-            contacts.report = *report;
-        }
-        work.points.sort_unstable_by_key(|point| {
-            let other = match point.other {
-                Touched::Obstacle(index) => (0, index as u64),
-                Touched::Body(key) => (1, key),
-                Touched::Probe(index) => (2, index as u64),
-            };
-            (point.member, other, point.site)
-        });
-        for &probe in self.held {
-            self.probes[probe].memory.clear();
-        }
-        points::tell(self, work);
-        for point in &work.points {
-            if let Some((probe, contact, memory)) = points::keep_at_probe(self, point) {
-                let probe = &mut self.probes[probe];
-                probe.contacts.push(contact);
-                probe.memory.extend(memory);
-            }
-            let force = point.world_force();
-            if point.pushed[0] <= 0.0 || !force.iter().all(|x| x.is_finite()) {
-                continue;
-            }
-            self.keep(point, &force);
-        }
-        for member in 0..self.len() {
-            let contacts = self.parts(member).contacts;
-            contacts.report.contacts = contacts.list.len();
-            // A body whose sites touch nothing may still be touched.
-            contacts.theta = if contacts.list.is_empty() { 0.5 } else { theta };
-        }
-    }
-
-    /// Keeps a contact with force for the next step, and lists it at both bodies.
-    fn keep(&mut self, point: &ContactPoint, force: &Vector3<f64>) {
-        let held = point.pushed[1].hypot(point.pushed[2]);
-        let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
-        let normal = point.axes.row(0).transpose();
-        let dent = point.compliance * force;
-        let penetration = (-(point.off[0] + point.floor + normal.dot(&dent))).max(0.0);
-        let add = |contacts: &mut Contacts, contact: Contact, compliance: &Matrix3<f64>| {
-            let report = &mut contacts.report;
-            report.force = (Vector3::from(report.force) + Vector3::from(contact.force)).into();
-            report.penetration = report.penetration.max(penetration);
-            report.energy += 0.5 * force.dot(&(compliance * force));
-            contacts.list.push(contact);
-        };
-        let mut contact = Contact {
-            other: point.other,
-            vertex: 0,
-            point: point.place.into(),
-            normal: normal.into(),
-            force: (*force).into(),
-            penetration,
-            sliding,
-        };
-        if let Some(at) = &point.probe {
-            let Some((_, carriers)) = &at.first else { return };
-            let sites = self.view(point.member).sites();
-            let site = carriers.largest().and_then(|site| sites?.sites.get(site));
-            contact.vertex = site.map_or(0, |site| site.vertex);
-            add(self.parts(point.member).contacts, contact, &point.compliance);
-            return;
-        }
-        let view = self.view(point.member);
-        let key = view.contacts.key;
-        let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { return };
-        let mut anchor = if sliding { point.end + dent } else { point.anchor };
-        // The next step holds the material of the new contact point.
-        anchor += point.place - point.end;
-        let toward = if site.radius > 0.0 { point.last } else { point.first };
-        contact.vertex = site.vertex;
-        let far = point.far.as_ref().map(|far| {
-            let view = self.view(far.member);
-            let turn = view.state.frame.rotation().inverse();
-            let sites = view.sites();
-            let field = sites.map(|sites| sites.field(&view.kernel.model));
-            let rest = field.map_or_else(Vector3::zeros, |field| field.rest(&far.place));
-            let site = far.carriers.largest().and_then(|site| sites?.sites.get(site));
-            let vertex = site.map_or(0, |site| site.vertex);
-            (rest + turn * (anchor - far.end), vertex)
-        });
-        if let Some(at) = point.rigid {
-            // What sticks to a rigid body stays in its axes.
-            anchor = self.rigids[at.rigid].to_local(&anchor, self.h);
-        }
-        let (anchor, vertex) = far.unwrap_or((anchor, 0));
-        let own = point.compliance - point.far.map_or_else(Matrix3::zeros, |far| far.compliance);
-        let contacts = self.parts(point.member).contacts;
-        let place = point.far.map(|far| far.place);
-        let (other, site) = (point.other, point.site);
-        contacts.memory.push(Memory { other, site, force: *force, anchor, toward, place });
-        add(contacts, contact, &own);
-        if let Some(far) = &point.far {
-            let opposite = Contact {
-                other: Touched::Body(key),
-                vertex,
-                normal: (-normal).into(),
-                force: (-force).into(),
-                ..contact
-            };
-            add(self.parts(far.member).contacts, opposite, &far.compliance);
-        }
-    }
-}
-
-/// Whether the contacts did more work on the bodies than they are allowed to.
-fn gained(work: &Touching, recovers: bool) -> bool {
-    let (mut done, mut allowed, mut scale) = (0.0, 0.0, 0.0f64);
-    for point in &work.points {
-        let force = point.world_force();
-        let along = force.dot(&(point.end - point.start - point.carried));
-        let (stored, before) = (point.stored(&force), point.stored(&point.before));
-        done += along + stored - before;
-        scale += along.abs() + stored + before;
-        if recovers {
-            allowed += point.pushed[0] * (point.floor - point.gap).max(0.0);
-        }
-    }
-    done > 1.5 * allowed + 1e-9 * scale
-}
-
-/// The rigid motion that has the momentum of all members.
-#[derive(Debug, Clone, Copy, Default)]
-struct Common {
-    center: Vector3<f64>,
-    velocity: Vector3<f64>,
-    spin: Vector3<f64>,
-    /// Kinetic energy, J.
-    energy: f64,
-}
-
-impl Common {
-    fn of<P: Member>(group: &Group<'_, P>, counts: &impl Fn(usize) -> bool) -> Self {
-        let (mut mass, mut center, mut linear) = (0.0, Vector3::zeros(), Vector3::zeros());
-        for member in (0..group.len()).filter(|&member| counts(member)) {
-            let View { kernel, state, .. } = group.view(member);
-            let own = kernel.model.mass();
-            mass += own;
-            center += own * Vector3::from(state.frame.center());
-            linear += own * Vector3::from(state.frame.velocity());
-        }
-        let (center, velocity) = (center / mass, linear / mass);
-        let (mut inertia, mut angular) = (Matrix3::zeros(), Vector3::zeros());
-        for member in (0..group.len()).filter(|&member| counts(member)) {
-            let View { kernel, state, .. } = group.view(member);
-            let arm = Vector3::from(state.frame.center()) - center;
-            let momentum = kernel.model.mass() * (Vector3::from(state.frame.velocity()) - velocity);
-            angular += Vector3::from(state.frame.spin()) + arm.cross(&momentum);
-            let outer = Matrix3::identity() * arm.norm_squared() - arm * arm.transpose();
-            inertia += state.frame.inertia(&kernel.model) + kernel.model.mass() * outer;
-        }
-        let spin = inertia.try_inverse().map_or_else(Vector3::zeros, |inverse| inverse * angular);
-        let energy = 0.5 * mass * velocity.norm_squared() + 0.5 * spin.dot(&angular);
-        Self { center, velocity, spin, energy }
-    }
-
-    /// Multiplies all motion of a body besides this one.
-    fn slow(&self, kernel: &Kernel, state: &mut State, left: f64) {
-        state.v.iter_mut().for_each(|v| *v *= left);
-        if kernel.model.is_free() {
-            let frame: &mut Frame = &mut state.frame;
-            let arm = Vector3::from(frame.center()) - self.center;
-            let velocity = self.velocity + self.spin.cross(&arm);
-            let spin = frame.inertia(&kernel.model) * self.spin;
-            frame.slow_to(&velocity, &spin, left);
         }
     }
 }

@@ -2,8 +2,8 @@
 
 use nalgebra::Vector3;
 
-use super::{Kernel, Six, State, tangent};
-use crate::{ModalModel, StepError, error::finite};
+use super::{Kernel, Six, State};
+use crate::{ModalModel, StepError, error::finite, step::patch::tangent};
 
 /// Accessor for basis rows, with the arguments vertex, axis and mode.
 type BasisEntry = fn(&ModalModel, u32, usize, usize) -> f32;
