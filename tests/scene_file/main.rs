@@ -5,8 +5,6 @@ mod mistakes;
 mod needs;
 mod running;
 
-use bevy::prelude::*;
-
 use pliant::scene::*;
 
 /// A valid scene, line by line.

@@ -15,18 +15,15 @@
 //! is `HDerror` (unsigned 32 bit) at 0, `int` at 4 and `HHD` (unsigned 32 bit) at 8; `HDboolean` is
 //! an unsigned char; `HDulong` is `unsigned long`, of 8 bytes on Linux and 4 on Windows.
 
-use std::{
-    ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void},
-    mem::ManuallyDrop,
-    path::PathBuf,
-    sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, AtomicU32, Ordering},
-    },
-    time::{Duration, Instant},
-};
+mod info;
+mod servo;
 
-use libloading::Library;
+use std::ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void};
+use std::mem::ManuallyDrop;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, PoisonError};
+
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
@@ -34,6 +31,8 @@ use crate::{
     Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Scheduler, StopHandle, Wrench,
     device::renewal::Renewal,
 };
+use info::{describe, read_info};
+use servo::{HdForceSwitch, HdStop, PRIORITY, SCHEDULER, ScheduledFrame, servo};
 
 /// Handle of a device.
 type Handle = c_uint;
@@ -78,13 +77,8 @@ const CALIBRATION_NEEDS_UPDATE: c_uint = 0x5001;
 const CALIBRATION_AUTO: c_int = 1 << 1;
 const CALIBRATION_INKWELL: c_int = 1 << 2;
 const BAD_HANDLE: c_uint = 0x0104;
-const PRIORITY: c_ushort = u16::MAX / 2;
-const MAX_PRIORITY: c_ushort = u16::MAX;
-const CALLBACK_DONE: c_uint = 0;
 /// Most errors that are taken from the library's stack at once.
 const MAX_ERRORS: usize = 256;
-/// Time that the servo thread has to run the supervisor's callback.
-const SERVO_PATIENCE: Duration = Duration::from_millis(10);
 
 type Callback = unsafe extern "system" fn(*mut c_void) -> c_uint;
 
@@ -137,15 +131,6 @@ impl OpenHapticsApi {
     }
 }
 
-/// The library's scheduler, of which a process has one.
-struct ServoScheduler {
-    /// Number of open devices. The scheduler starts with the first device and stops with the last.
-    open: usize,
-    running: bool,
-}
-
-static SCHEDULER: Mutex<ServoScheduler> = Mutex::new(ServoScheduler { open: 0, running: false });
-
 /// Choice of the device and of the library.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OpenHapticsConfig {
@@ -184,143 +169,6 @@ pub struct OpenHaptics {
     /// Whether the scheduler did not run the last frame. The frame is its own until the scheduler
     /// has been stopped and the device opened again.
     dead: bool,
-}
-
-/// Switches the force off from another thread.
-struct HdForceSwitch {
-    api: OpenHapticsApi,
-    /// The open device, or [`INVALID`].
-    handle: AtomicU32,
-    cut: AtomicBool,
-    /// Whether the servo thread has run the last cut.
-    obeyed: AtomicBool,
-    /// The library stays loaded as long as this value can call it.
-    _library: Arc<Library>,
-}
-
-/// Sends no force and switches the force output off, on the servo thread.
-///
-/// # Safety
-/// `data` is one count of an `Arc<HdForceSwitch>`, which this function takes over.
-unsafe extern "system" fn cut_force(data: *mut c_void) -> c_uint {
-    // SAFETY: the caller passes the count over.
-    let switch = unsafe { Arc::from_raw(data.cast_const().cast::<HdForceSwitch>()) };
-    let device = switch.handle.load(Ordering::Acquire);
-    if device != INVALID {
-        let api = switch.api;
-        // SAFETY: as in `servo`.
-        unsafe {
-            (api.begin)(device);
-            (api.set_double)(CURRENT_FORCE, [0.0f64; 3].as_ptr());
-            (api.end)(device);
-            (api.disable)(FORCE_OUTPUT);
-            let _ = api.drain();
-        }
-    }
-    switch.obeyed.store(true, Ordering::Release);
-    CALLBACK_DONE
-}
-
-/// The handle that the loop's supervisor gets.
-struct HdStop(Arc<HdForceSwitch>);
-
-impl StopHandle for HdStop {
-    fn cut(&self) {
-        let switch = &self.0;
-        switch.cut.store(true, Ordering::Release);
-        if switch.handle.load(Ordering::Acquire) == INVALID {
-            return;
-        }
-        switch.obeyed.store(false, Ordering::Release);
-        let data = Arc::into_raw(switch.clone()).cast_mut().cast();
-        // SAFETY: the callback takes over the count. A scheduler that never runs it leaves the few
-        // bytes of one count behind.
-        unsafe { (switch.api.post)(cut_force, data, MAX_PRIORITY) };
-        let posted = Instant::now();
-        while !switch.obeyed.load(Ordering::Acquire) {
-            if posted.elapsed() >= SERVO_PATIENCE {
-                // The servo is dead or stuck, and with it every device of this process. A thread
-                // that holds the lock hangs in a call of the library itself.
-                let was_running = SCHEDULER.try_lock().is_ok_and(|mut s| std::mem::take(&mut s.running));
-                if was_running {
-                    // SAFETY: the function takes nothing.
-                    unsafe { (switch.api.stop)() };
-                }
-                return;
-            }
-            std::thread::sleep(Duration::from_micros(500));
-        }
-    }
-}
-
-/// Input and output of a callback. The device keeps it at one place in memory, because a scheduler
-/// that is stuck may run the callback late.
-struct ScheduledFrame {
-    switch: Arc<HdForceSwitch>,
-    device: Handle,
-    force: [f64; 3],
-    /// Whether the force is to be zero, because it comes back or ends.
-    idle: bool,
-    /// Whether the force output is to be switched off after the frame.
-    leave: bool,
-    /// The safety switch in the frame before, and then in this one.
-    held: Option<bool>,
-    /// Whether an open safety switch means that the force is off.
-    was_held: bool,
-    /// Whether the callback has run at all.
-    ran: bool,
-    /// Whether the force was sent as it was given.
-    force_on: bool,
-    position: [f64; 3],
-    velocity: [f64; 3],
-    /// Transform, column-major, millimeters.
-    transform: [f64; 16],
-    buttons: c_int,
-    error: ErrorInfo,
-}
-
-/// Runs one frame on the library's servo thread: writes the force and reads the state.
-///
-/// # Safety
-/// `data` is a `ScheduledFrame` that nothing else accesses until this function has returned.
-unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
-    // SAFETY: `OpenHaptics::frame` passes its own frame and waits.
-    let frame = unsafe { &mut *data.cast::<ScheduledFrame>() };
-    let api = frame.switch.api;
-    frame.ran = true;
-    // SAFETY: the calls and the lengths of their arrays are those of the header, and the calls lie
-    // between begin and end, as the header requires. The frame makes its device the current one.
-    unsafe {
-        (api.begin)(frame.device);
-        let error = api.drain();
-        let mut held: c_uchar = 0;
-        (api.get_boolean)(CURRENT_SAFETY_SWITCH, &raw mut held);
-        // A device without the switch answers with an error, which is no fault.
-        let held = (api.drain().code == 0).then_some(held != 0);
-        let taken = held == Some(true) && frame.held == Some(false);
-        let released = held == Some(false) && frame.was_held;
-        frame.held = held;
-        let cut = frame.switch.cut.load(Ordering::Acquire);
-        let enabled = (api.is_enabled)(FORCE_OUTPUT) != 0;
-        frame.force_on = !(frame.idle || cut || !enabled || taken || released);
-        let force = if frame.force_on { frame.force } else { [0.0; 3] };
-        (api.set_double)(CURRENT_FORCE, force.as_ptr());
-        (api.get_double)(CURRENT_POSITION, frame.position.as_mut_ptr());
-        (api.get_double)(CURRENT_VELOCITY, frame.velocity.as_mut_ptr());
-        (api.get_double)(CURRENT_TRANSFORM, frame.transform.as_mut_ptr());
-        (api.get_integer)(CURRENT_BUTTONS, &raw mut frame.buttons);
-        (api.end)(frame.device);
-        let later = api.drain();
-        frame.error = if error.code == 0 { later } else { error };
-        if frame.leave {
-            (api.disable)(FORCE_OUTPUT);
-        } else if (cut || !enabled) && frame.error.code == 0 {
-            // The supervisor or the library has switched the force off. It comes back at zero.
-            (api.enable)(FORCE_OUTPUT);
-            frame.switch.cut.store(false, Ordering::Release);
-        }
-    }
-    CALLBACK_DONE
 }
 
 impl OpenHaptics {
@@ -491,73 +339,6 @@ impl OpenHaptics {
             sequence: None,
         })
     }
-}
-
-/// Returns the assumed properties before the device was queried.
-fn describe(config: &OpenHapticsConfig) -> DeviceInfo {
-    DeviceInfo {
-        name: "3D Systems device".into(),
-        serial: String::new(),
-        peak_force: 3.3,
-        continuous_force: 0.88,
-        peak_torque: 0.0,
-        force_axes: [true; 3],
-        torque_axes: [false; 3],
-        max_stiffness: 400.0,
-        max_damping: 4.0,
-        damping: 0.2,
-        friction: 0.2,
-        mass: 0.045,
-        resolution: 55e-6,
-        // The force that answers a measurement goes out with the next servo tick.
-        delay: 1.0 / config.rate,
-        workspace: [[-0.08, -0.06, -0.035], [0.08, 0.06, 0.035]],
-        buttons: 4,
-        simulated: false,
-    }
-}
-
-/// Reads the properties of the current device. Values that are not usable keep the assumed ones.
-///
-/// # Safety
-/// A device is current, and `api` is that of a loaded library.
-unsafe fn read_info(api: &OpenHapticsApi, config: &OpenHapticsConfig) -> DeviceInfo {
-    let mut info = describe(config);
-    let double = |what: c_uint, scale: f64, or: f64| {
-        let mut value = [0.0f64; 16];
-        // SAFETY: no parameter of HDAPI has more than 16 doubles.
-        let error = unsafe {
-            (api.get_double)(what, value.as_mut_ptr());
-            api.drain()
-        };
-        let value = value[0] * scale;
-        if error.code == 0 && value.is_finite() && value > 0.0 { value } else { or }
-    };
-    // The library gives the stiffness in N/mm and the damping in N s/mm.
-    info.max_stiffness = double(NOMINAL_MAX_STIFFNESS, 1e3, info.max_stiffness);
-    info.max_damping = double(NOMINAL_MAX_DAMPING, 1e3, info.max_damping);
-    info.peak_force = double(NOMINAL_MAX_FORCE, 1.0, info.peak_force);
-    info.continuous_force =
-        double(NOMINAL_MAX_CONTINUOUS_FORCE, 1.0, info.continuous_force).min(info.peak_force);
-    let mut box_mm = [0.0f64; 16];
-    // SAFETY: the library writes six doubles, smallest corner first. It owns the strings.
-    unsafe {
-        (api.get_double)(USABLE_WORKSPACE_DIMENSIONS, box_mm.as_mut_ptr());
-        let error = api.drain();
-        let [a, b, c, d, e, f, ..] = box_mm.map(|x| 1e-3 * x);
-        if error.code == 0
-            && [a, b, c].into_iter().zip([d, e, f]).all(|(l, h)| l.is_finite() && h.is_finite() && l < h)
-        {
-            info.workspace = [[a, b, c], [d, e, f]];
-        }
-        let name = text((api.get_string)(DEVICE_MODEL_TYPE));
-        if !name.is_empty() {
-            info.name = name;
-        }
-        info.serial = text((api.get_string)(DEVICE_SERIAL_NUMBER));
-        let _ = api.drain();
-    }
-    info
 }
 
 impl HapticDevice for OpenHaptics {

@@ -14,8 +14,8 @@ mod machine;
 use std::time::{Duration, Instant};
 
 use pliant_haptics::{
-    Cycle, Fault, HapticLoop, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig, LoopEvent,
-    RealScheduler, SafetyConfig, Sample, Spelling, StaleConfig, VirtualScheduler, Wrench,
+    Cycle, Fault, HapticDevice, HapticLoop, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig,
+    LoopEvent, RealScheduler, SafetyConfig, Sample, Spelling, StaleConfig, VirtualScheduler, Wrench,
 };
 
 use service::{Service, state};

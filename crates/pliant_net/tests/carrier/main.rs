@@ -7,5 +7,3 @@ mod sessions;
 
 #[path = "../support/mod.rs"]
 mod support;
-
-use bevy::prelude::*;

@@ -1,204 +1,23 @@
-//! Tests of sessions that ride on an app's own carrier.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+//! What a port does with connections, calls and messages, and what it bounds.
 
-mod support;
-
-use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use bevy::math::DVec3;
 use bevy::prelude::*;
 use bytes::Bytes;
-use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody};
 use pliant_net::transport::{
     Carrier, CarrierPort, Channel, Event, Fingerprint, Limits, MeshCarrier, PeerId, RateCap, RemotePath,
     SendError,
 };
 use pliant_net::{
-    DisconnectReason, HandOf, HostConfig, JoinConfig, NetGuest, NetHost, NetPlugin, NetStats, PeerConfig,
-    Role, SessionClosed, SessionCommands, SessionState, SharedBody, User, UserLeft,
+    DisconnectReason, HostConfig, JoinConfig, NetPlugin, Role, SessionClosed, SessionCommands, SessionState,
 };
-use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
-use support::{Look, TIP, alone, app, bar, body_of, messages, must, only, wait_for};
 
-const SERVER: u64 = 0;
-const CLIENT: u64 = 7;
-const ROOM: usize = 1200;
-
-/// A netcode in memory: reliable messages in order, and datagrams of which 9 % are lost and many
-/// overtake others.
-struct Network {
-    began: Instant,
-    delay: Duration,
-    server: CarrierPort,
-    client: CarrierPort,
-    /// To the client, and to the server.
-    messages: [EmulatedLink<Bytes>; 2],
-    datagrams: [EmulatedLink<Bytes>; 2],
-}
-
-impl Network {
-    fn new() -> Self {
-        Self::with_delay(Duration::from_millis(30))
-    }
-
-    fn with_delay(delay: Duration) -> Self {
-        let keys = [b"server".as_slice(), b"client"].map(Fingerprint::of_name);
-        let even = LinkConfig { delay, keep_order: true, ..LinkConfig::default() };
-        let uneven = LinkConfig {
-            delay,
-            loss: Loss::Random(0.09),
-            jitter: Duration::from_millis(2),
-            reorder: 0.1,
-            duplicate: 0.02,
-            ..LinkConfig::default()
-        };
-        let network = Self {
-            began: Instant::now(),
-            delay,
-            server: CarrierPort::new(keys[0]),
-            client: CarrierPort::new(keys[1]),
-            messages: [1, 2].map(|seed| EmulatedLink::new(even.clone(), seed)),
-            datagrams: [3, 4].map(|seed| EmulatedLink::new(uneven.clone(), seed)),
-        };
-        network.connect();
-        network
-    }
-
-    fn connect(&self) {
-        let path = |key| RemotePath { key, role: Role::Hold, max_datagram: ROOM };
-        self.server.connected(CLIENT, path(Fingerprint::of_name(b"client")));
-        self.client.connected(SERVER, path(Fingerprint::of_name(b"server")));
-        for (port, remote) in [(&self.server, CLIENT), (&self.client, SERVER)] {
-            port.set_round_trip(remote, 2 * self.delay);
-        }
-    }
-
-    fn carry(&mut self) {
-        let now = self.began.elapsed();
-        for (to, from) in [&self.server, &self.client].into_iter().enumerate() {
-            while let Some(out) = from.poll() {
-                let len = out.bytes.len();
-                match out.channel {
-                    Channel::Message => self.messages[to].send(now, out.bytes, len),
-                    Channel::Datagram => {
-                        assert!(len <= ROOM, "{len} bytes");
-                        self.datagrams[to].send(now, out.bytes, len);
-                    }
-                }
-            }
-        }
-        for (to, (port, remote)) in [(&self.client, SERVER), (&self.server, CLIENT)].into_iter().enumerate() {
-            while let Some(bytes) = self.messages[to].poll(now) {
-                port.receive(remote, Channel::Message, bytes);
-            }
-            while let Some(bytes) = self.datagrams[to].poll(now) {
-                port.receive(remote, Channel::Datagram, bytes);
-            }
-        }
-    }
-
-    fn run_until<L: Look>(
-        &mut self,
-        apps: &mut [&mut App],
-        awaited: &str,
-        mut look: impl FnMut(&mut [&mut App]) -> L,
-    ) -> L::Found {
-        wait_for(awaited, || {
-            std::thread::sleep(Duration::from_millis(4));
-            self.carry();
-            apps.iter_mut().for_each(|app| app.update());
-            look(apps)
-        })
-    }
-}
-
-fn state(app: &App) -> SessionState {
-    *app.world().resource::<SessionState>()
-}
-
-#[test]
-fn a_session_rides_on_another_netcode_at_9_percent_loss() {
-    let _alone = alone();
-    let (mut ann, mut bob) = (app(NetPlugin::default()), app(NetPlugin::default()));
-    let mut network = Network::new();
-    let (server, client) = (network.server.clone(), network.client.clone());
-    let handle = ann.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
-    ann.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar")));
-
-    // Joined before anybody hosts: the guest tries until somebody does.
-    bob.world_mut().commands().join_session_over(client.join(SERVER, Limits::guest()), JoinConfig::default());
-    network.run_until(&mut [&mut ann, &mut bob], "nobody hosts", |apps| {
-        let guest = apps[1].world().get_resource::<NetGuest>()?;
-        let reason = DisconnectReason::Silent;
-        (*guest.state() == pliant_net::GuestState::Lost { reason }).then_some(())
-    });
-    ann.world_mut().commands().host_session_over(server.host(Limits::host()), HostConfig::default());
-    // The model has to cross, too.
-    let there = network.run_until(&mut [&mut ann, &mut bob], "the body arrives", |apps| body_of(apps[1]));
-    assert_eq!((state(&ann), state(&bob)), (SessionState::Hosting, SessionState::Joined));
-    assert!(ann.world().resource::<NetHost>().invite().is_none());
-
-    let target = DVec3::new(1.0, 0.3, 0.2);
-    let grab = bob.world_mut().spawn((Grab::new(TIP, 0.3, target), GrabOf(there))).id();
-    let force = network.run_until(&mut [&mut ann, &mut bob], "Bob feels what Ann computes", |apps| {
-        let mut query = apps[0].world_mut().query::<(&HandOf, &GrabForce)>();
-        let felt = query.single(apps[0].world()).map_err(|error| error.to_string())?.1.force;
-        let own = apps[1].world().get::<GrabForce>(grab).ok_or("none")?.force;
-        must!(felt.length() > 1.0 && own.distance(felt) < 0.02 * felt.length(), "{own}, truly {felt}");
-        Ok(felt.length())
-    });
-    let begin = support::tick(&ann);
-    network.run_until(&mut [&mut ann, &mut bob], "ten seconds", |apps| support::tick(apps[0]) > begin + 400);
-    let stats = *bob.world().resource::<NetStats>();
-    let lost = network.datagrams[0].counts();
-    println!(
-        "{force:.2} N; {} of {} datagrams to the guest lost, which counts {:.1} %; {:.0} bytes/s in, round trip {:?}",
-        lost.lost,
-        lost.sent,
-        100.0 * stats.loss_in,
-        stats.bytes_in_per_s,
-        stats.round_trip
-    );
-    // Four standard deviations of a share of 9 % in 400 are 5.7 %.
-    let share = lost.lost as f64 / lost.sent as f64;
-    assert!(lost.sent > 300 && (share - 0.09).abs() < 0.06, "{lost:?}");
-    assert!(stats.loss_in > 0.02 && stats.loss_in < 0.2 && stats.rejected == 0, "{stats:?}");
-
-    bob.world_mut().commands().leave_session();
-    network.run_until(&mut [&mut ann, &mut bob], "Bob has left", |apps| {
-        only::<HandOf>(apps[0]).is_none() && messages::<UserLeft>(apps[0]).len() == 1
-    });
-    assert_eq!(messages::<UserLeft>(&ann)[0].reason, DisconnectReason::Left);
-    bob.world_mut().commands().join_session_over(client.join(SERVER, Limits::guest()), JoinConfig::default());
-    network.run_until(&mut [&mut ann, &mut bob], "he is back", |apps| body_of(apps[1]));
-
-    // Ann leaves and hosts again in the same frame. What is left of the old session comes first.
-    ann.world_mut().commands().leave_session();
-    ann.world_mut().commands().host_session_over(server.host(Limits::host()), HostConfig::default());
-    network.run_until(&mut [&mut ann, &mut bob], "Bob knows that it is over", |apps| {
-        state(apps[0]) == SessionState::Hosting && state(apps[1]) == SessionState::Idle
-    });
-    let over: Vec<_> = messages::<SessionClosed>(&bob).into_iter().map(|closed| closed.reason).collect();
-    assert_eq!(over, [DisconnectReason::Left; 2], "once his own doing, once hers");
-    bob.world_mut().commands().join_session_over(client.join(SERVER, Limits::guest()), JoinConfig::default());
-    network.run_until(&mut [&mut ann, &mut bob], "he is in the next one", |apps| body_of(apps[1]));
-
-    // The netcode loses him.
-    server.disconnected(CLIENT, DisconnectReason::Lost);
-    client.disconnected(SERVER, DisconnectReason::Lost);
-    network.run_until(&mut [&mut ann, &mut bob], "they have lost each other", |apps| {
-        let mut users = apps[0].world_mut().query::<&User>();
-        users.iter(apps[0].world()).count() == 1 && state(apps[1]) == SessionState::Lost
-    });
-    network.connect();
-    network.run_until(&mut [&mut ann, &mut bob], "he joins again by himself", |apps| {
-        state(apps[1]) == SessionState::Joined
-    });
-}
+use super::network::{CLIENT, Network, ROOM, SERVER};
+use super::sessions::state;
+use super::support::{self, alone, app, messages, must, wait_for};
 
 /// Two ports that are connected without loss or delay.
-fn ports() -> (CarrierPort, CarrierPort, impl Fn()) {
+pub(super) fn ports() -> (CarrierPort, CarrierPort, impl Fn()) {
     let network = Network::new();
     let (server, client) = (network.server, network.client);
     let (from, to) = (server.clone(), client.clone());
@@ -213,11 +32,21 @@ fn ports() -> (CarrierPort, CarrierPort, impl Fn()) {
     (server, client, carry)
 }
 
-fn closed(carrier: &impl Carrier) -> Option<DisconnectReason> {
+pub(super) fn closed(carrier: &impl Carrier) -> Option<DisconnectReason> {
     std::iter::from_fn(|| carrier.poll()).find_map(|event| match event {
         Event::Closed { reason, .. } => Some(reason),
         _ => None,
     })
+}
+
+/// A message of a port: what it is, the number of the connection, and its content.
+fn raw(kind: u8, number: u16, content: &[u8]) -> Bytes {
+    let [low, high] = number.to_le_bytes();
+    [&[kind, low, high], content].concat().into()
+}
+
+fn drained(carrier: &impl Carrier) -> Vec<Event> {
+    std::iter::from_fn(|| carrier.poll()).collect()
 }
 
 #[test]
@@ -337,143 +166,6 @@ fn a_call_that_is_forgotten_or_not_answered_ends() {
         Some(Event::Closed { peer, reason: DisconnectReason::Silent }) => peer == another,
         _ => false,
     });
-}
-
-/// Peers on ports, each connected with each, over links that lose 9 % of the datagrams.
-struct Party {
-    began: Instant,
-    ports: Vec<CarrierPort>,
-    /// From the first to the second of each pair: messages, and datagrams.
-    links: BTreeMap<(usize, usize), [EmulatedLink<Bytes>; 2]>,
-}
-
-fn name(peer: usize) -> Fingerprint {
-    Fingerprint::of_name(&[peer as u8])
-}
-
-impl Party {
-    fn new(count: usize) -> Self {
-        let delay = Duration::from_millis(20);
-        let even = LinkConfig { delay, keep_order: true, ..LinkConfig::default() };
-        let uneven = LinkConfig { delay, loss: Loss::Random(0.09), reorder: 0.1, ..LinkConfig::default() };
-        let ports: Vec<CarrierPort> = (0..count).map(|peer| CarrierPort::new(name(peer))).collect();
-        let mut links = BTreeMap::new();
-        for (from, port) in ports.iter().enumerate() {
-            for to in (0..count).filter(|&to| to != from) {
-                port.connected(to as u64, RemotePath { key: name(to), role: Role::Hold, max_datagram: ROOM });
-                let seed = (10 * from + to) as u64;
-                let pair = [(even.clone(), seed), (uneven.clone(), seed + 100)];
-                links.insert((from, to), pair.map(|(config, seed)| EmulatedLink::new(config, seed)));
-            }
-        }
-        Self { began: Instant::now(), ports, links }
-    }
-
-    fn run_until<L: Look>(
-        &mut self,
-        apps: &mut [&mut App],
-        awaited: &str,
-        mut look: impl FnMut(&mut [&mut App]) -> L,
-    ) -> L::Found {
-        wait_for(awaited, || {
-            std::thread::sleep(Duration::from_millis(4));
-            let now = self.began.elapsed();
-            for (from, port) in self.ports.iter().enumerate() {
-                while let Some(out) = port.poll() {
-                    let link = self.links.get_mut(&(from, out.remote as usize)).unwrap();
-                    let (kind, len) = (usize::from(out.channel == Channel::Datagram), out.bytes.len());
-                    link[kind].send(now, out.bytes, len);
-                }
-            }
-            for (&(from, to), links) in &mut self.links {
-                for (link, channel) in links.iter_mut().zip([Channel::Message, Channel::Datagram]) {
-                    while let Some(bytes) = link.poll(now) {
-                        self.ports[to].receive(from as u64, channel, bytes);
-                    }
-                }
-            }
-            apps.iter_mut().for_each(|app| app.update());
-            look(apps)
-        })
-    }
-}
-
-#[test]
-fn three_peers_ride_on_another_netcode_and_all_feel_one_body() {
-    let _alone = alone();
-    let mut party = Party::new(3);
-    let [mut a, mut b, mut c] = [(); 3].map(|()| app(NetPlugin::default()));
-    let mut bodies = Vec::new();
-    for app in [&mut a, &mut b, &mut c] {
-        let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
-        bodies.push(app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar"))).id());
-    }
-    let join = |app: &mut App, port: &CarrierPort, through: Option<usize>| {
-        let join = through.map(|peer| CarrierPort::invite_of(name(peer)));
-        let config = PeerConfig { join, ..PeerConfig::default() };
-        app.world_mut().commands().join_peers_over(port.mesh(Limits::host()), config);
-    };
-    let users = |app: &mut App| app.world_mut().query::<&User>().iter(app.world()).count();
-    join(&mut a, &party.ports[0], None);
-    join(&mut b, &party.ports[1], Some(0));
-    party.run_until(&mut [&mut a, &mut b, &mut c], "two are together", |apps| {
-        users(apps[0]) == 2 && users(apps[1]) == 2
-    });
-    // The third one joins through the second, which tells it of the first.
-    join(&mut c, &party.ports[2], Some(1));
-    let all = |apps: &mut [&mut App]| apps.iter_mut().all(|app| users(app) == 3);
-    party.run_until(&mut [&mut a, &mut b, &mut c], "all are together", all);
-
-    let target = DVec3::new(1.0, 0.3, 0.2);
-    c.world_mut().spawn((Grab::new(TIP, 0.3, target), GrabOf(bodies[2])));
-    party.run_until(&mut [&mut a, &mut b, &mut c], "all see the same", |apps| {
-        let shown = apps.iter().zip(&bodies).map(|(app, &body)| {
-            app.world().get::<pliant_body::VisualState>(body).map_or(0.0, |visual| visual.q()[0])
-        });
-        let shown: Vec<f64> = shown.collect();
-        must!(shown[0].abs() > 0.05, "{shown:?}");
-        must!(shown.iter().all(|q| (q / shown[0] - 1.0).abs() < 0.01), "{shown:?}");
-        Ok(())
-    });
-
-    // The one through whom the third has come leaves, and the others go on.
-    b.world_mut().commands().leave_session();
-    party.run_until(&mut [&mut a, &mut b, &mut c], "two go on", |apps| {
-        users(apps[0]) == 2 && users(apps[2]) == 2 && state(apps[1]) == SessionState::Idle
-    });
-    for app in [&a, &c] {
-        assert_eq!(messages::<UserLeft>(app)[0].reason, DisconnectReason::Left);
-    }
-    join(&mut b, &party.ports[1], Some(2));
-    party.run_until(&mut [&mut a, &mut b, &mut c], "it comes back", all);
-
-    // One whose netcode has lost another finds it again.
-    let lost = DisconnectReason::Lost;
-    party.ports[0].disconnected(2, lost);
-    party.ports[2].disconnected(0, lost);
-    party.run_until(&mut [&mut a, &mut b, &mut c], "they have lost each other", |apps| users(apps[0]) == 2);
-    for (one, other) in [(0, 2), (2, 0)] {
-        let path = RemotePath { key: name(other), role: Role::Hold, max_datagram: ROOM };
-        party.ports[one].connected(other as u64, path);
-    }
-    party.run_until(&mut [&mut a, &mut b, &mut c], "they are together again", all);
-
-    // Nobody is there by that key.
-    b.world_mut().commands().leave_session();
-    join(&mut b, &party.ports[1], Some(9));
-    party.run_until(&mut [&mut b], "nobody is there", |apps| {
-        !messages::<pliant_net::SessionFailed>(apps[0]).is_empty()
-    });
-}
-
-/// A message of a port: what it is, the number of the connection, and its content.
-fn raw(kind: u8, number: u16, content: &[u8]) -> Bytes {
-    let [low, high] = number.to_le_bytes();
-    [&[kind, low, high], content].concat().into()
-}
-
-fn drained(carrier: &impl Carrier) -> Vec<Event> {
-    std::iter::from_fn(|| carrier.poll()).collect()
 }
 
 #[test]
