@@ -14,7 +14,7 @@ use bevy::{
 use pliant::{
     bake::{BakeConfig, Material, bake},
     mesh::shapes,
-    modal::{Elasticity, State},
+    modal::State,
     prelude::*,
 };
 use serde::de::DeserializeSeed;
@@ -195,7 +195,6 @@ fn a_body_waits_for_the_shapes_of_its_hands_and_goes_on_bit_for_bit() {
     let assets = folder.to_str().unwrap();
     let mut scene = app(assets);
     spawn(&mut scene, "bar", "bar.modal", Vec3::ZERO, |body| {
-        body.settings.elasticity = Elasticity::Reduced;
         body.rest_speed = 0.0;
     });
     wait_for_bodies(&mut scene, 1);

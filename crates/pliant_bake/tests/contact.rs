@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
-    Body, BodyConfig, Capsule, Cuboid, Damping, Elasticity, Frame, GrabConfig, Material, ModalModel, Moving,
+    Body, BodyConfig, Capsule, Cuboid, Damping, Frame, GrabConfig, Material, ModalModel, Moving,
     ObstacleShape, Patch, Plane, Sphere, StepError, StepSettings, SurfacePoint,
 };
 
@@ -82,8 +82,6 @@ fn at_rest_the_contact_forces_carry_the_weight() {
     ] {
         let mut fall = scene(0.0, 0.5);
         fall.gap = 0.02;
-        fall.settings.elasticity =
-            if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
         let mut body = place(&model, &fall);
         run(&mut body, 5.0);
         let weight = model.mass() * GRAVITY;
@@ -236,8 +234,6 @@ fn a_pressed_ball_is_about_as_stiff_as_hertz_says() {
             let mut press = scene(0.0, 0.0);
             press.settings.gravity = [0.0, -force / model.mass(), 0.0];
             press.settings.damping_scale = 20.0;
-            press.settings.elasticity =
-                if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
             let mut body = place(&model, &press);
             run(&mut body, 10.0);
             let got = radius - body.frame().center()[1];
@@ -292,8 +288,6 @@ fn no_contact_ever_adds_energy() {
             for (rate, speed) in [(60.0, 1.0), (60.0, 50.0), (1000.0, 3.0)] {
                 let mut fall = scene(0.0, 0.6);
                 (fall.rate, fall.gap) = (rate, 0.1);
-                fall.settings.elasticity =
-                    if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
                 let mut body = place(model, &fall);
                 body.set_obstacles(obstacles.clone()).unwrap();
                 let mut state = body.state().clone();

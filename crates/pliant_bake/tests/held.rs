@@ -266,7 +266,7 @@ fn shapes_are_the_same_every_time_and_go_with_the_last_grab() {
     assert_eq!(stranger.set_held_shapes(Some(Arc::new(make()))), Err(StepError::OtherModel));
     body.grab(&patch, GrabConfig::default()).unwrap();
     body.set_held_shapes(Some(Arc::new(make()))).unwrap();
-    let linear = StepSettings::default();
+    let linear = StepSettings { elasticity: Elasticity::Linear, ..Default::default() };
     body.reconfigure(linear.into()).unwrap();
     assert!(body.state().s.is_empty());
     body.step().unwrap();

@@ -7,8 +7,7 @@ use nalgebra::Vector3;
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
-    Body, BodyConfig, Damping, Elasticity, Frame, Islands, Material, ModalModel, Plane, StepSettings,
-    Together, Touched,
+    Body, BodyConfig, Damping, Frame, Islands, Material, ModalModel, Plane, StepSettings, Together, Touched,
 };
 
 const GRAVITY: f64 = 9.81;
@@ -40,8 +39,7 @@ fn place(
     velocity: [f64; 3],
     spin: [f64; 3],
 ) -> Body {
-    let elasticity = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
-    let settings = StepSettings { gravity: [0.0, -gravity, 0.0], elasticity, ..Default::default() };
+    let settings = StepSettings { gravity: [0.0, -gravity, 0.0], ..Default::default() };
     let mut body =
         Body::new(model.clone(), BodyConfig { step: 1.0 / rate, ..BodyConfig::from(settings) }).unwrap();
     let mut state = body.state().clone();

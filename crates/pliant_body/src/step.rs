@@ -11,7 +11,7 @@ use bevy::{
     tasks::ComputeTaskPool,
 };
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, Islands, ModalModel, Patch, Probe, StepError, Together, Touched,
+    Body, BodyConfig, GrabConfig, Islands, ModalModel, Patch, Probe, StepError, Together, Touched,
 };
 
 use crate::{
@@ -433,9 +433,9 @@ pub(crate) fn step_bodies(
 /// Steps bodies on the threads of the compute pool, where there is more work than handing it out.
 fn on_all_threads<'a>(bodies: &mut [Together<'a>], step: fn(&mut Together<'a>)) {
     // In steps of a linear body of 20 modes, which take about half a microsecond.
-    let work = |together: &Together<'_>| match together.body.config().settings.elasticity {
-        Elasticity::Linear => 1 + together.body.mode_count() / 20,
-        Elasticity::Reduced => 300,
+    let work = |together: &Together<'_>| {
+        let body = &together.body;
+        if body.config().settings.is_reduced(body.model()) { 300 } else { 1 + body.mode_count() / 20 }
     };
     let work: usize = bodies.iter().filter(|body| !body.resting).map(work).sum();
     batches(bodies, work >= 200, |batch| batch.iter_mut().for_each(step));

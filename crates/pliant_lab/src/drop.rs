@@ -151,11 +151,7 @@ fn tick(bodies: &[Body], time: f64, step_us: f64) -> DropTick {
 
 /// Makes a body for a fall.
 fn make(model: &Arc<ModalModel>, drop: &Drop, elasticity: Option<Elasticity>) -> Result<Body, LabError> {
-    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
-    let elasticity = elasticity.unwrap_or(of_model);
-    if elasticity == Elasticity::Reduced && model.material().is_none() {
-        return Err(LabError::NoMaterial);
-    }
+    let elasticity = crate::elasticity_of(model, elasticity)?;
     let settings = StepSettings { elasticity, gravity: [0.0, -drop.gravity, 0.0], ..StepSettings::default() };
     let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / drop.rate, ..settings.into() })?;
     body.set_friction(drop.friction)?;

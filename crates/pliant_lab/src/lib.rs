@@ -48,6 +48,8 @@ pub mod report;
 pub mod simulate;
 pub mod stability;
 
+use pliant_modal::{Elasticity, ModalModel};
+
 pub use error::LabError;
 pub use progress::Progress;
 
@@ -55,4 +57,14 @@ pub use progress::Progress;
 pub(crate) fn smooth(t: f64) -> f64 {
     let t = t.clamp(0.0, 1.0);
     t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+}
+
+/// The elasticity of a body of this model: what is asked for, or what the model has.
+fn elasticity_of(model: &ModalModel, asked: Option<Elasticity>) -> Result<Elasticity, LabError> {
+    match (asked, model.material()) {
+        (Some(Elasticity::Reduced), None) => Err(LabError::NoMaterial),
+        (Some(asked), _) => Ok(asked),
+        (None, Some(_)) => Ok(Elasticity::Reduced),
+        (None, None) => Ok(Elasticity::Linear),
+    }
 }

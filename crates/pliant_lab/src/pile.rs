@@ -80,11 +80,7 @@ impl Pile {
         if !model.is_free() {
             return Err(LabError::Anchored);
         }
-        let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
-        let elasticity = pile.elasticity.unwrap_or(of_model);
-        if elasticity == Elasticity::Reduced && model.material().is_none() {
-            return Err(LabError::NoMaterial);
-        }
+        let elasticity = crate::elasticity_of(model, pile.elasticity)?;
         let settings = StepSettings { elasticity, gravity: [0.0, -9.81, 0.0], ..StepSettings::default() };
         let config = BodyConfig { step: 1.0 / pile.rate, ..settings.into() };
         let mut bodies = Vec::with_capacity(pile.count);

@@ -92,11 +92,7 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
         return Err(ModelError::Value { what: "point of the pull", index: 0, expected, got }.into());
     }
     let _pinned = Pinned::new();
-    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
-    let elasticity = pull.elasticity.unwrap_or(of_model);
-    if elasticity == Elasticity::Reduced && model.material().is_none() {
-        return Err(LabError::NoMaterial);
-    }
+    let elasticity = crate::elasticity_of(model, pull.elasticity)?;
     let config =
         BodyConfig::from(StepSettings { elasticity, gravity: pull.gravity, ..StepSettings::default() });
     let step = config.step;

@@ -103,9 +103,7 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
         let reduced = body.settings.elasticity == Elasticity::Reduced && !body.material.is_empty();
         if !body.material.is_empty() {
             let mut on = reduced;
-            // A body that relaxes has linear elasticity only.
-            let elastic = body.settings.relaxation.is_none();
-            ui.add_enabled(elastic, Checkbox::new(&mut on, format!("reduced elasticity, {}", body.material)))
+            ui.checkbox(&mut on, format!("reduced elasticity, {}", body.material))
                 .on_hover_text("Forces of large strains; off is linear, which costs a hundredth.");
             if on != reduced {
                 body.settings.elasticity = if on { Elasticity::Reduced } else { Elasticity::Linear };

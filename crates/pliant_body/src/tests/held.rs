@@ -25,7 +25,6 @@ fn bar() -> ModalModel {
 }
 
 fn reduced(body: &mut ModalBody) {
-    body.settings.elasticity = Elasticity::Reduced;
     body.settings.damping_scale = 30.0;
 }
 

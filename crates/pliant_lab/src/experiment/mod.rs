@@ -212,7 +212,7 @@ impl Experiment {
             seconds: 30.0,
             seed: 1,
             modes: None,
-            elasticity: Elasticity::default(),
+            elasticity: Elasticity::Linear,
             integrator: recovery.integrator(),
             relaxation: None,
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },

@@ -8,15 +8,16 @@ use crate::{Integrator, ModalModel, Relaxation, StepError};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Elasticity {
-    /// The forces are those of small strains, `omega^2 q`. Default.
+    /// The forces are those of small strains, `omega^2 q`.
     ///
-    /// A step costs a few microseconds. The forces are wrong as soon as a pull can be seen.
-    #[default]
+    /// A step costs a few microseconds. The forces are wrong as soon as a pull can be seen. For
+    /// crowds, and for bodies that are only looked at.
     Linear,
     /// The forces are those of the model's material for large strains and rotations, reduced to the
-    /// coordinates of the model (see [`ReducedElasticity`](crate::ReducedElasticity)).
+    /// coordinates of the model (see [`ReducedElasticity`](crate::ReducedElasticity)). Default.
     ///
     /// A model without a material is stepped as [`Elasticity::Linear`].
+    #[default]
     Reduced,
 }
 
@@ -36,7 +37,8 @@ impl std::fmt::Display for Elasticity {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StepSettings {
-    /// How the body resists deformation. Default: [`Elasticity::Linear`].
+    /// How the body resists deformation. Default: [`Elasticity::Reduced`], which only a model that
+    /// was baked with a material has.
     pub elasticity: Elasticity,
     /// Integrator of the modes. Default: [`Integrator::Exact`].
     ///
