@@ -14,6 +14,7 @@ use pliant_modal::{
 };
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
+use pliant_stream::watch::{BodyDecoder, Catalog, Hands, WatchSurface};
 use pliant_stream::wire::{Datagram, GuestMessage, HostMessage, PeerMessage};
 use pliant_stream::{
     BodyId, Channel, GrabState, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
@@ -21,7 +22,7 @@ use pliant_stream::{
 };
 
 /// All targets by name.
-pub const TARGETS: [(&str, fn(&[u8])); 10] = [
+pub const TARGETS: [(&str, fn(&[u8])); 11] = [
     ("datagrams", datagrams),
     ("messages", messages),
     ("peers", peers),
@@ -32,6 +33,7 @@ pub const TARGETS: [(&str, fn(&[u8])); 10] = [
     ("session", session),
     ("guests", guests),
     ("mesh", mesh),
+    ("watch", watch),
 ];
 
 const BODY: BodyId = BodyId(1);
@@ -67,6 +69,30 @@ pub fn messages(bytes: &[u8]) {
 pub fn peers(bytes: &[u8]) {
     if let Ok(message) = PeerMessage::decode(bytes) {
         assert_eq!(PeerMessage::decode(&message.encode()), Ok(message));
+    }
+}
+
+/// What watchers get of a relay: catalogs, hands and surfaces, and frames of a body, each behind a
+/// byte with its length. What was read must be writable and read back equal.
+pub fn watch(bytes: &[u8]) {
+    if let Ok(catalog) = Catalog::decode(bytes) {
+        assert_eq!(Catalog::decode(&catalog.encode()), Ok(catalog));
+    }
+    if let Ok(hands) = Hands::decode(bytes) {
+        assert!(Hands::decode(&hands.encode()).is_ok());
+    }
+    if let Ok(surface) = WatchSurface::decode(bytes) {
+        assert_eq!(WatchSurface::decode(&surface.encode()), Ok(surface));
+    }
+    let mut decoder = BodyDecoder::new(vec![1.0; 8]);
+    let mut rest = bytes;
+    while let Some((&length, behind)) = rest.split_first() {
+        let (frame, behind) = behind.split_at(usize::from(length).min(behind.len()));
+        rest = behind;
+        if let Ok((_, state)) = decoder.decode(frame) {
+            assert!(state.q.iter().all(|q| q.is_finite()));
+            assert!(state.pose.is_none_or(|pose| pose.is_valid()));
+        }
     }
 }
 

@@ -157,6 +157,42 @@ fn corpora_are_written() {
     ] {
         write("peers", name, &message.encode());
     }
+    // What watchers get.
+    use pliant_stream::watch::{
+        BodyEncoder, Catalog, CatalogBody, Hands, WatchConfig, WatchHand, WatchSurface,
+    };
+    let model = support::loose_bar(4, 0.05);
+    let body = CatalogBody {
+        id: direct::BODY,
+        name: "bar".into(),
+        model: model.hash(),
+        file_bytes: 9,
+        surface_bytes: 9,
+        modes: 4,
+        every: 1,
+        warps: true,
+        free: true,
+        placement: pliant_stream::Placement::default(),
+        color: [9; 4],
+    };
+    let name = "a session".to_owned();
+    let catalog = Catalog { session: 1, step: 0.025, name, bodies: vec![body], cameras: Vec::new() };
+    write("watch", "catalog", &catalog.encode());
+    write("watch", "hands", &Hands { hands: vec![WatchHand::default(); 2], ..Hands::default() }.encode());
+    write("watch", "surface", &WatchSurface::new(&support::bar(2, 0.05), 2).encode());
+    let config = WatchConfig { rate: 40.0, ..WatchConfig::default() };
+    let mut encoder = BodyEncoder::new(&model, config, 0.025).unwrap();
+    let mut frames = Vec::new();
+    for tick in 0..12 {
+        let q = [0.01 * tick as f64, -0.02, 0.0, 0.3];
+        let pose = Some(pliant_stream::RigidState::default());
+        let (v, a, z, grabs) = (&[][..], &[][..], &[][..], &[][..]);
+        let state = pliant_stream::TickState { tick, q: &q, v, a, z, pose, grabs, resting: false };
+        let frame = encoder.encode(&state).unwrap().unwrap().bytes;
+        frames.push(u8::try_from(frame.len()).unwrap());
+        frames.extend(frame);
+    }
+    write("watch", "frames", &frames);
     write("traces", "trace", b"12.5\nlost # a comment\n13\n");
     write("traces", "loss", b"gilbert:9%:4");
     write("model", "bar", &support::bar(2, 0.05).to_bytes());

@@ -69,6 +69,7 @@
 //! | [`recovery`] | loss repair: prediction and compensation after the paper, and force-driven recovery |
 //! | [`codec`] | closed-loop frame encoding, in which rounding does not add up; quantization per mode |
 //! | [`wire`] | byte formats; every parser accepts arbitrary bytes |
+//! | [`watch`] | what watchers without number get over relays: catalog, models, bodies, hands |
 //! | [`emulator`] | a seeded emulator of a bad network |
 //! | [`newmark`] | the identities that make compensation exact |
 
@@ -94,6 +95,7 @@ pub mod session;
 mod side_by_side;
 mod state;
 mod surroundings;
+pub mod watch;
 pub mod wire;
 
 pub use error::StreamError;

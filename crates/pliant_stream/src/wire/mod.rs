@@ -5,7 +5,7 @@
 //! ranges, allocates at most in proportion to the bytes given, and returns an error instead of
 //! panicking.
 
-mod bits;
+pub(crate) mod bits;
 mod bytes;
 mod datagram;
 mod frame;

@@ -1,0 +1,195 @@
+//! Which state to draw at which time: a little behind the host, so that there is a next state. The
+//! page in `page/playout.ts` does the same.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::WatchState;
+use crate::state::{RigidState, Tick};
+
+/// Most states of a body that wait to be drawn.
+const MOST: usize = 64;
+/// How long the earliest arrivals count.
+const WINDOW: Duration = Duration::from_secs(5);
+/// A jump of the offset that is no jitter, s.
+const JUMP: f64 = 1.0;
+/// Number of frames by which a group may begin before what was seen last.
+const OVERLAP: u64 = 1000;
+
+/// The host's ticks by the clock of the watcher: the line through the earliest arrivals of the last
+/// seconds, which are those that waited least.
+#[derive(Debug, Clone)]
+pub struct TickClock {
+    step: f64,
+    /// When an arrival was, and by how much its tick was ahead of the watcher's clock, s. Later
+    /// entries are less ahead, and the first one counts.
+    ahead: VecDeque<(Duration, f64)>,
+}
+
+impl TickClock {
+    /// A clock for ticks of `step` seconds.
+    pub fn new(step: f64) -> Self {
+        Self { step, ahead: VecDeque::new() }
+    }
+
+    /// A tick has arrived at `now`.
+    pub fn arrived(&mut self, tick: Tick, now: Duration) {
+        let offset = tick as f64 * self.step - now.as_secs_f64();
+        // Another count of ticks, or a pause of this machine.
+        if self.ahead.front().is_some_and(|(_, known)| (offset - known).abs() > JUMP) {
+            self.ahead.clear();
+        }
+        while self.ahead.back().is_some_and(|(_, less)| *less <= offset) {
+            self.ahead.pop_back();
+        }
+        self.ahead.push_back((now, offset));
+        while self.ahead.front().is_some_and(|(at, _)| *at + WINDOW < now) {
+            self.ahead.pop_front();
+        }
+    }
+
+    /// The tick to draw at `now`, `delay` behind the earliest arrivals. `None` before the first
+    /// one.
+    pub fn tick(&self, now: Duration, delay: Duration) -> Option<f64> {
+        let (_, offset) = self.ahead.front()?;
+        Some((now.as_secs_f64() + offset - delay.as_secs_f64()) / self.step)
+    }
+}
+
+/// The states of a body that are drawn or wait.
+#[derive(Debug, Clone)]
+pub struct Playout {
+    every: u64,
+    states: VecDeque<WatchState>,
+}
+
+impl Playout {
+    /// For a body with `every` ticks from one frame to the next.
+    pub fn new(every: u64) -> Self {
+        Self { every: every.max(1), states: VecDeque::new() }
+    }
+
+    /// The newest state.
+    pub fn newest(&self) -> Option<&WatchState> {
+        self.states.back()
+    }
+
+    /// Takes a state. One that is older than the newest is left out, unless ticks are counted anew.
+    pub fn push(&mut self, state: WatchState) {
+        if let Some(last) = self.states.back() {
+            if state.tick <= last.tick {
+                if last.tick - state.tick < OVERLAP * self.every {
+                    return;
+                }
+                self.states.clear();
+            } else if last.resting && state.tick > last.tick + self.every {
+                // It slept until a moment ago, and did not glide all that time.
+                let until = WatchState { tick: state.tick - self.every, ..last.clone() };
+                self.states.push_back(until);
+            }
+        }
+        self.states.push_back(state);
+        while self.states.len() > MOST {
+            self.states.pop_front();
+        }
+    }
+
+    /// Writes the state at a tick: coordinates into `q`, and returns the pose of a free body.
+    /// `None` without a state. Beyond the newest state the body stays in it.
+    pub fn at(&mut self, tick: f64, q: &mut Vec<f64>) -> Option<Option<RigidState>> {
+        while self.states.get(1).is_some_and(|next| next.tick as f64 <= tick) {
+            self.states.pop_front();
+        }
+        let from = self.states.front()?;
+        let to = self.states.get(1).unwrap_or(from);
+        let span = (to.tick - from.tick) as f64;
+        let part = if span > 0.0 { ((tick - from.tick as f64) / span).clamp(0.0, 1.0) } else { 0.0 };
+        q.clear();
+        let ends = from.q.iter().zip(&to.q);
+        q.extend(ends.map(|(a, b)| a + (b - a) * part));
+        let pose = from.pose.zip(to.pose).map(|(a, b)| between(&a, &b, part));
+        Some(pose.or(to.pose))
+    }
+}
+
+/// The pose `part` of the way from one to another. Frames are close, so that the straight line
+/// between two quaternions, scaled to unit length, is as good as the arc.
+fn between(from: &RigidState, to: &RigidState, part: f64) -> RigidState {
+    let along: f64 = from.rotation.iter().zip(to.rotation).map(|(a, b)| a * b).sum();
+    let sign = if along < 0.0 { -1.0 } else { 1.0 };
+    let mix = |a: f64, b: f64| a + (b - a) * part;
+    let turned: [f64; 4] = std::array::from_fn(|k| mix(from.rotation[k], sign * to.rotation[k]));
+    let norm = turned.iter().map(|x| x * x).sum::<f64>().sqrt();
+    RigidState {
+        position: std::array::from_fn(|k| mix(from.position[k], to.position[k])),
+        rotation: if norm > 1e-6 { turned.map(|x| x / norm) } else { to.rotation },
+        ..RigidState::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state(tick: Tick, x: f64, resting: bool) -> WatchState {
+        WatchState { tick, q: vec![x], pose: None, resting }
+    }
+
+    #[test]
+    fn the_picture_moves_evenly_behind_late_arrivals() {
+        let step = 1.0 / 60.0;
+        let mut clock = TickClock::new(step);
+        let mut playout = Playout::new(2);
+        let mut seed = 1_u64;
+        let (mut worst, mut q) = (0.0_f64, Vec::new());
+        for frame in 0..600_u64 {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            // A frame each 1/30 s, up to 30 ms late. Ticks begin at 5,000.
+            let late = 0.03 * (seed >> 40) as f64 / (1_u64 << 24) as f64;
+            let sent = frame as f64 / 30.0;
+            let now = Duration::from_secs_f64(1.0 + sent + late);
+            let tick = 5000 + 2 * frame;
+            clock.arrived(tick, now);
+            playout.push(state(tick, tick as f64, false));
+            let drawn = clock.tick(now, Duration::from_secs_f64(1.0 / 30.0 + 0.04)).unwrap();
+            if frame > 60 {
+                playout.at(drawn, &mut q).unwrap();
+                // What is drawn is the tick itself, since the coordinate is its number.
+                worst = worst.max((q[0] - drawn).abs());
+                let due = 5000.0 + 60.0 * (sent + late) - 60.0 * (1.0 / 30.0 + 0.04);
+                assert!((drawn - due).abs() < 0.5, "tick {drawn} at {due}");
+            }
+        }
+        assert!(worst < 1e-6, "the picture is off by {worst} ticks");
+    }
+
+    #[test]
+    fn sleep_new_counts_and_floods() {
+        let mut playout = Playout::new(2);
+        let mut q = Vec::new();
+        assert_eq!(playout.at(0.0, &mut q), None);
+        playout.push(state(100, 1.0, true));
+        playout.push(state(500, 2.0, false));
+        playout.at(400.0, &mut q).unwrap();
+        assert_eq!(q, [1.0], "a body that slept until just now does not glide");
+        playout.at(499.0, &mut q).unwrap();
+        assert_eq!(q, [1.5]);
+        playout.push(state(480, 9.0, false));
+        assert_eq!(playout.newest().unwrap().tick, 500, "an old state is left out");
+        playout.at(1e9, &mut q).unwrap();
+        assert_eq!(q, [2.0]);
+        for tick in 501..5000 {
+            playout.push(state(tick, 0.0, false));
+        }
+        assert!(playout.states.len() <= MOST);
+        // A host that has started again counts from the beginning.
+        playout.push(state(7, 3.0, false));
+        assert_eq!(playout.newest().unwrap().tick, 7);
+        let mut clock = TickClock::new(0.1);
+        assert_eq!(clock.tick(Duration::ZERO, Duration::ZERO), None);
+        clock.arrived(1000, Duration::from_secs(1));
+        clock.arrived(7, Duration::from_secs(2));
+        let tick = clock.tick(Duration::from_secs(2), Duration::ZERO).unwrap();
+        assert!((tick - 7.0).abs() < 1e-9);
+    }
+}
