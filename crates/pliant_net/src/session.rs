@@ -459,24 +459,24 @@ pub(crate) fn give_back(world: &mut World, entity: Entity) {
     let Ok(mut entity) = world.get_entity_mut(entity) else { return };
     entity.remove::<(RemoteBody, RemoteHands, FixedObstacles)>();
     entity.insert(Driven::Local);
-    let shown = entity.get::<VisualState>().map(|visual| visual.q().to_vec());
-    let (Some(shown), Some(mut state)) = (shown, entity.get_mut::<BodyState>()) else { return };
-    let set = at_rest(state.body(), shown).and_then(|rest| state.body_mut().set_state(&rest));
+    let visual = entity.get::<VisualState>().map(|visual| visual.q().to_vec());
+    let (Some(visual), Some(mut state)) = (visual, entity.get_mut::<BodyState>()) else { return };
+    let set = at_rest(state.body(), visual).and_then(|rest| state.body_mut().set_state(&rest));
     if let Err(error) = set {
         debug!("a body goes on as it was before the session: {error}");
     }
 }
 
-/// Returns the state of a body that has had the shape `shown` for long. The session has moved the
+/// Returns the state of a body that has had the shape `visual` for long. The session has moved the
 /// entity, and the next tick takes the pose over from there. All else that the body has of its own
 /// is from before the session.
-fn at_rest(body: &Body, shown: Vec<f64>) -> Result<State, StepError> {
+fn at_rest(body: &Body, visual: Vec<f64>) -> Result<State, StepError> {
     let (before, frame) = (body.state(), body.frame());
     let viscous = !before.z.is_empty();
     let frame = Frame::from_motion(body.model(), frame.center(), frame.orientation(), [0.0; 3], [0.0; 3])?;
-    let zero = State::zero(shown.len(), viscous);
-    let z = if viscous { shown.clone() } else { Vec::new() };
-    Ok(State { q: shown, z, s: vec![0.0; before.s.len()], frame, ..zero })
+    let zero = State::zero(visual.len(), viscous);
+    let z = if viscous { visual.clone() } else { Vec::new() };
+    Ok(State { q: visual, z, s: vec![0.0; before.s.len()], frame, ..zero })
 }
 
 /// Keeps what is told of the session until no session is taken out of the world.

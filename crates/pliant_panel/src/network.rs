@@ -26,7 +26,7 @@ pub struct NetworkView {
     /// on a host, which does not wait for data.
     pub repaired: Option<[u64; 2]>,
     /// Number of requests for repeated ticks, sent by a guest or received by a host.
-    pub requested_again: u64,
+    pub nacks: u64,
     /// Number of complete states applied from snapshots.
     pub snapshots: u64,
     /// Number of datagrams that this end dropped because a queue was full or the path too narrow.
@@ -180,7 +180,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
         }
         line(
             "requested again",
-            format!("{} ticks, snapshots: {}", network.requested_again, network.snapshots),
+            format!("{} ticks, snapshots: {}", network.nacks, network.snapshots),
             "Lost ticks that were requested again, and complete states that were received.",
         );
         line(

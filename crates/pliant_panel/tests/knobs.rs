@@ -257,7 +257,7 @@ fn the_figures_of_a_session_are_shown_with_their_units() {
         loss: [9.0, 8.5],
         rate: [103.0, 20.0],
         repaired: Some([12, 11]),
-        requested_again: 4,
+        nacks: 4,
         snapshots: 1,
         dropped: 3,
         queueing: true,

@@ -46,7 +46,7 @@ pub(crate) struct Collector {
 struct Measured {
     /// Time of the newest measurement.
     newest: Instant,
-    figure: Arc<Metric>,
+    metric: Arc<Metric>,
 }
 
 /// The given name of a hand and its recorded name.
@@ -440,7 +440,7 @@ fn measure(
         if let Some(known) = measured.get_mut(diagnostic.path()) {
             if known.newest != measurement.time {
                 known.newest = measurement.time;
-                to.push((known.figure.clone(), measurement.value));
+                to.push((known.metric.clone(), measurement.value));
             }
             continue;
         }
@@ -449,8 +449,8 @@ fn measure(
             true => rest.to_owned(),
             false => format!("metrics/{rest}"),
         });
-        let figure = Arc::new(Metric { path, unit: diagnostic.suffix.trim().to_owned() });
-        to.push((figure.clone(), measurement.value));
-        measured.insert(diagnostic.path().clone(), Measured { newest: measurement.time, figure });
+        let metric = Arc::new(Metric { path, unit: diagnostic.suffix.trim().to_owned() });
+        to.push((metric.clone(), measurement.value));
+        measured.insert(diagnostic.path().clone(), Measured { newest: measurement.time, metric });
     }
 }

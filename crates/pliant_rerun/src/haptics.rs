@@ -36,15 +36,15 @@ pub(crate) fn see_devices(
     mut metrics: Local<Metrics>,
 ) {
     if !devices.iter().map(|(id, _)| id).eq(metrics.iter().map(|(id, _)| *id)) {
-        let figure = |name: &str, what: &str, unit: &str| {
+        let metric = |name: &str, what: &str, unit: &str| {
             Arc::new(Metric { path: format!("device/{name}/{what}"), unit: unit.to_owned() })
         };
         let of = |name: &str| {
             [
-                figure(name, "force", "N"),
-                figure(name, "late, 99 %", "us"),
-                figure(name, "missed periods", ""),
-                figure(name, "given to the hand", "J"),
+                metric(name, "force", "N"),
+                metric(name, "late, 99 %", "us"),
+                metric(name, "missed periods", ""),
+                metric(name, "given to the hand", "J"),
             ]
         };
         *metrics = names(&devices).iter().map(|(id, name)| (*id, of(name))).collect();

@@ -127,8 +127,8 @@ impl Recorder {
         if let Some(hands) = &frame.hands {
             self.hands(hands)?;
         }
-        for (figure, value) in &frame.measured {
-            self.scalar(&figure.path, &figure.unit, *value)?;
+        for (metric, value) in &frame.measured {
+            self.scalar(&metric.path, &metric.unit, *value)?;
         }
         for scalar in &frame.scalars {
             self.scalar(&scalar.path, &scalar.unit, scalar.value)?;
@@ -215,7 +215,7 @@ impl Recorder {
         let laid_out = self.send().and(self.lay_out(true));
         let flushed = self.stream.flush_blocking();
         if let Err(error) = laid_out {
-            bevy::log::warn!("the last figures or the layout were not recorded: {error}");
+            bevy::log::warn!("the last metrics or the layout were not recorded: {error}");
         }
         if let Err(error) = flushed {
             bevy::log::warn!("the end of the recording may be missing: {error}");

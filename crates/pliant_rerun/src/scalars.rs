@@ -66,9 +66,9 @@ impl RerunScalars {
     }
 
     #[cfg(feature = "haptics")]
-    pub(crate) fn measured(&mut self, figure: &Arc<Metric>, value: f64) {
+    pub(crate) fn measured(&mut self, metric: &Arc<Metric>, value: f64) {
         if self.measured.len() < Self::LIMIT {
-            self.measured.push((figure.clone(), value));
+            self.measured.push((metric.clone(), value));
         }
     }
 

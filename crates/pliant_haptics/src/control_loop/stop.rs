@@ -26,16 +26,16 @@ impl StopSwitch {
         self.0.load(Ordering::Acquire)
     }
 
-    /// Releases the switch, and tells the loop to unlatch by `tell`. Returns `false` and changes
+    /// Releases the switch, and notifies the loop to unlatch by `notify`. Returns `false` and changes
     /// nothing if the loop's queue has no room for it.
-    pub(crate) fn reset(&self, has_room: bool, tell: impl FnOnce() -> bool) -> bool {
+    pub(crate) fn reset(&self, has_room: bool, notify: impl FnOnce() -> bool) -> bool {
         if !has_room {
             return false;
         }
         // Released first: a loop that is told before would find the switch pressed, and latch
         // again.
         self.0.store(false, Ordering::Release);
-        tell()
+        notify()
     }
 
     /// Lets the loop do what it was told, and then latches a pressed switch, so that a press takes

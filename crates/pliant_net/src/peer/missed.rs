@@ -1,6 +1,6 @@
 //! Whom a peer misses, and at which addresses it looks for them.
 //!
-//! An address that another peer tells of may be false, by a lie or because it is old. Each teller
+//! An address that another peer reports may be false, by a lie or because it is old. Each reporter
 //! has an address of its own for everybody who is missed, and only so many calls under way, so that
 //! a false one keeps no true one away.
 
@@ -13,10 +13,10 @@ use tracing::debug;
 use crate::retry::Retry;
 use crate::transport::{Fingerprint, Invite};
 
-/// Most lost peers that are tracked, and most of whom one teller tells. Of those that were lost
+/// Most lost peers that are tracked, and most that one reporter may report. Of those that were lost
 /// here, the one that was lost first is given up first.
 const MAX_MISSED: usize = 64;
-/// Most calls under way to addresses that one teller has told of, and that all have.
+/// Most calls under way to addresses that one reporter has reported, and that all have reported.
 const CALLS_OF_ONE: usize = 8;
 const CALLS_OF_ALL: usize = 64;
 
@@ -25,8 +25,8 @@ const CALLS_OF_ALL: usize = 64;
 struct Trace {
     number: UserId,
     invite: Invite,
-    /// Who has told of the address; `None` for a peer that was lost here.
-    teller: Option<UserId>,
+    /// Who has reported the address; `None` for a peer that was lost here.
+    reporter: Option<UserId>,
     retry: Retry,
     /// The next attempt may be made.
     due: bool,
@@ -65,40 +65,48 @@ impl Missed {
 
     /// Looks for a peer that was lost here, where it was last reached.
     pub(super) fn lose(&mut self, now: Duration, number: UserId, invite: Invite) {
-        let own = || self.traces.iter().filter(|trace| trace.teller.is_none());
+        let own = || self.traces.iter().filter(|trace| trace.reporter.is_none());
         if own().any(|trace| trace.number == number) {
             return;
         }
         if own().count() >= MAX_MISSED
-            && let Some(first) = self.traces.iter().position(|trace| trace.teller.is_none())
+            && let Some(first) = self.traces.iter().position(|trace| trace.reporter.is_none())
         {
             self.traces.remove(first);
         }
         self.look(now, number, invite, None);
     }
 
-    /// Looks for a peer where another one tells that it is. A teller's later address takes the
+    /// Looks for a peer where another one reports it. A reporter's later address takes the
     /// place of its earlier one, unless that is being called.
-    pub(super) fn tell(&mut self, now: Duration, teller: UserId, number: UserId, invite: Invite) {
-        let told = |trace: &&Trace| trace.teller == Some(teller);
-        let count = self.traces.iter().filter(told).count();
-        let before = self.traces.iter().position(|trace| told(&trace) && trace.number == number);
+    pub(super) fn report(&mut self, now: Duration, reporter: UserId, number: UserId, invite: Invite) {
+        let reported = |trace: &&Trace| trace.reporter == Some(reporter);
+        let count = self.traces.iter().filter(reported).count();
+        let before = self.traces.iter().position(|trace| reported(&trace) && trace.number == number);
         match before.and_then(|at| self.traces.get(at).map(|trace| (at, trace))) {
             Some((_, trace)) if trace.calling.is_some() || trace.invite == invite => {}
             Some((at, _)) => {
                 self.traces.remove(at);
-                self.look(now, number, invite, Some(teller));
+                self.look(now, number, invite, Some(reporter));
             }
-            None if count < MAX_MISSED => self.look(now, number, invite, Some(teller)),
+            None if count < MAX_MISSED => self.look(now, number, invite, Some(reporter)),
             None => {}
         }
     }
 
-    fn look(&mut self, now: Duration, number: UserId, invite: Invite, teller: Option<UserId>) {
+    fn look(&mut self, now: Duration, number: UserId, invite: Invite, reporter: Option<UserId>) {
         let mut retry = Retry::default();
         if retry.schedule(now, self.patience, self.key) {
             debug!("user {} is looked for", number.0);
-            self.traces.push(Trace { number, invite, teller, retry, due: false, attempts: 0, calling: None });
+            self.traces.push(Trace {
+                number,
+                invite,
+                reporter,
+                retry,
+                due: false,
+                attempts: 0,
+                calling: None,
+            });
         }
     }
 
@@ -134,17 +142,17 @@ impl Missed {
         }
     }
 
-    /// The trace to call next: of the teller with the fewest calls under way, the one with the
+    /// The trace to call next: of the reporter with the fewest calls under way, the one with the
     /// fewest attempts.
     fn next(&self) -> Option<usize> {
         let under_way = || self.traces.iter().filter(|trace| trace.calling.is_some());
-        let calls = |trace: &Trace| match trace.teller {
+        let calls = |trace: &Trace| match trace.reporter {
             None => 0,
-            teller => under_way().filter(|other| other.teller == teller).count(),
+            reporter => under_way().filter(|other| other.reporter == reporter).count(),
         };
-        let all = under_way().filter(|trace| trace.teller.is_some()).count();
+        let all = under_way().filter(|trace| trace.reporter.is_some()).count();
         let room =
-            |trace: &Trace| trace.teller.is_none() || (all < CALLS_OF_ALL && calls(trace) < CALLS_OF_ONE);
+            |trace: &Trace| trace.reporter.is_none() || (all < CALLS_OF_ALL && calls(trace) < CALLS_OF_ONE);
         let may = |trace: &Trace| {
             let free = trace.due && trace.calling.is_none() && room(trace);
             free && !under_way().any(|other| other.meets(trace))
@@ -162,7 +170,7 @@ mod tests {
 
     const S: Duration = Duration::from_secs(1);
     const KEY: Fingerprint = Fingerprint([7; 32]);
-    const LIAR: UserId = UserId(3);
+    const MALICIOUS: UserId = UserId(3);
     const HONEST: UserId = UserId(4);
     const LOST: UserId = UserId(2);
 
@@ -185,15 +193,15 @@ mod tests {
     fn a_false_address_keeps_no_true_one_away() {
         let mut missed = Missed::new(60 * S, KEY);
         // The false one is called first, and nobody answers.
-        missed.tell(Duration::ZERO, LIAR, LOST, at(666));
+        missed.report(Duration::ZERO, MALICIOUS, LOST, at(666));
         assert_eq!(calls(&mut missed, S), [666]);
-        missed.tell(S, HONEST, LOST, at(1));
+        missed.report(S, HONEST, LOST, at(1));
         assert_eq!(calls(&mut missed, 2 * S), [1], "the true one is called beside it");
         assert_eq!(missed.count(), 1, "one peer is looked for");
         assert_eq!(missed.found(LOST), [PeerId(666), PeerId(1)]);
         assert_eq!(missed.count(), 0);
         // Where it was last reached here is called beside what others tell, too.
-        missed.tell(2 * S, LIAR, LOST, at(666));
+        missed.report(2 * S, MALICIOUS, LOST, at(666));
         missed.lose(2 * S, LOST, at(1));
         let mut called = calls(&mut missed, 3 * S);
         called.sort_unstable();
@@ -201,20 +209,20 @@ mod tests {
     }
 
     #[test]
-    fn one_tellers_false_addresses_leave_room_for_anothers() {
+    fn false_addresses_of_one_reporter_leave_room_for_those_of_another() {
         let mut missed = Missed::new(60 * S, KEY);
         let (mut largest, mut called) = (0, 0);
         for half in 0..40_u16 {
             let now = S / 2 * u32::from(half);
             for number in 1..=200 {
-                missed.tell(now, LIAR, UserId(number), at(1000 + number + 200 * half));
+                missed.report(now, MALICIOUS, UserId(number), at(1000 + number + 200 * half));
             }
             largest = largest.max(missed.traces.len());
             called += calls(&mut missed, now + S / 4).len();
         }
         assert_eq!((largest, called), (MAX_MISSED, CALLS_OF_ONE), "none of the calls ends");
         let now = 20 * S;
-        missed.tell(now, HONEST, LOST, at(1));
+        missed.report(now, HONEST, LOST, at(1));
         missed.lose(now, UserId(300), at(2));
         let mut called = calls(&mut missed, now + S);
         called.sort_unstable();
@@ -224,8 +232,8 @@ mod tests {
     #[test]
     fn two_that_tell_of_one_place_cause_one_call_at_a_time() {
         let mut missed = Missed::new(60 * S, KEY);
-        missed.tell(Duration::ZERO, LIAR, LOST, at(1));
-        missed.tell(Duration::ZERO, HONEST, LOST, at(1));
+        missed.report(Duration::ZERO, MALICIOUS, LOST, at(1));
+        missed.report(Duration::ZERO, HONEST, LOST, at(1));
         assert_eq!(calls(&mut missed, S), [1]);
         assert!(missed.ended(S, PeerId(1)));
         assert!(!missed.ended(S, PeerId(1)), "it has ended");

@@ -33,7 +33,7 @@ impl NetPeer {
     /// higher number connects, so that only one of two does.
     pub(super) fn look_for_introduced(&mut self, peer: PeerId, others: Vec<(UserId, String)>) {
         let PeerState::In { user: own } = self.state else { return };
-        let Some(teller) = self.others.get(&peer).and_then(|other| other.number) else { return };
+        let Some(reporter) = self.others.get(&peer).and_then(|other| other.number) else { return };
         let now = self.now();
         let here = self.others.iter().filter(|(peer, _)| self.is_in(**peer));
         let keys: BTreeSet<Fingerprint> = here.map(|(_, other)| other.key).collect();
@@ -43,7 +43,7 @@ impl NetPeer {
             // Nor is one who is there called as somebody else.
             let is_here = self.users.get(number).is_some() || keys.contains(&invite.fingerprint);
             if number < own && number != UserId::HOST && !is_here && !self.refused.contains(&number) {
-                self.missed.tell(now, teller, number, invite);
+                self.missed.report(now, reporter, number, invite);
             }
         }
     }

@@ -59,15 +59,15 @@ pub enum Access {
 }
 
 impl Access {
-    /// Returns the role that the token `shown` grants at `now`, or the reason for a refusal.
-    pub(super) fn role(&self, shown: Option<Token>, now: SystemTime) -> Result<Role, DisconnectReason> {
-        match (self, shown) {
+    /// Returns the role that the token `presented` grants at `now`, or the reason for a refusal.
+    pub(super) fn role(&self, presented: Option<Token>, now: SystemTime) -> Result<Role, DisconnectReason> {
+        match (self, presented) {
             (Self::Anyone, _) => Ok(Role::Hold),
             (Self::Tokens(_), None) => Err(DisconnectReason::MissingToken),
-            (Self::Tokens(grants), Some(shown)) => {
+            (Self::Tokens(grants), Some(presented)) => {
                 // All grants are compared, so that timing does not reveal which one matched.
                 let found = grants.iter().fold(None, |found, grant| {
-                    let same = grant.token == shown;
+                    let same = grant.token == presented;
                     found.or(same.then_some(grant))
                 });
                 match found {

@@ -27,8 +27,8 @@ use super::connections::{GRACE, MESSAGE_PART, PeerConnection};
 use super::endpoint::EndpointShared;
 use super::identity::{Fingerprint, SERVER_NAME};
 use super::invite::Invite;
-use super::places::Reservation;
 use super::queue::{Next, lock};
+use super::slots::Reservation;
 use super::stats::PeerStats;
 use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
 
@@ -91,7 +91,7 @@ async fn accept(shared: &Arc<EndpointShared>, quic: &quinn::Endpoint) {
                 debug!(%address, %error, "could not ask a guest to prove its address");
             }
         } else {
-            let Some(place) = Reservation::take(&shared.places, &shared.connections.limits, address.ip())
+            let Some(slot) = Reservation::take(&shared.slots, &shared.connections.limits, address.ip())
             else {
                 debug!(%address, "refused a guest: no room, or too many from its address");
                 incoming.refuse();
@@ -100,9 +100,9 @@ async fn accept(shared: &Arc<EndpointShared>, quic: &quinn::Endpoint) {
             handshakes.fetch_add(1, Ordering::Relaxed);
             let (shared, handshakes) = (Arc::clone(shared), Arc::clone(&handshakes));
             guests.spawn(async move {
-                let leaving = place.leaving();
+                let leaving = slot.leaving();
                 let welcomed = tokio::select! {
-                    welcomed = timeout(shared.connections.limits.handshake, welcome(&shared, incoming, place)) => welcomed,
+                    welcomed = timeout(shared.connections.limits.handshake, welcome(&shared, incoming, slot)) => welcomed,
                     () = leaving.notified() => Ok(Err(DisconnectReason::Silent)),
                     () = shared.stopped() => Ok(Err(DisconnectReason::Left)),
                 };
@@ -127,15 +127,15 @@ struct OpenConnection {
     connection: Connection,
     send: SendStream,
     recv: RecvStream,
-    /// The place at this host. `None` on a guest.
-    place: Option<Reservation>,
+    /// The slot at this host. `None` on a guest.
+    slot: Option<Reservation>,
 }
 
 /// The host's half of the handshake.
 async fn welcome(
     shared: &EndpointShared,
     incoming: Incoming,
-    place: Reservation,
+    slot: Reservation,
 ) -> Result<OpenConnection, DisconnectReason> {
     let connection = incoming.accept().map_err(reason_of)?.await.map_err(reason_of)?;
     let Some(fingerprint) = fingerprint_of(&connection) else {
@@ -166,7 +166,7 @@ async fn welcome(
         return Err(DisconnectReason::Lost);
     }
     let peer = PeerId(shared.next_peer.fetch_add(1, Ordering::Relaxed));
-    Ok(OpenConnection { peer, role, fingerprint, connection, send, recv, place: Some(place) })
+    Ok(OpenConnection { peer, role, fingerprint, connection, send, recv, slot: Some(slot) })
 }
 
 /// The guest's half of the handshake: one attempt, whose result is reported as an event.
@@ -250,7 +250,7 @@ async fn enter(
         connection,
         send,
         recv,
-        place: None,
+        slot: None,
     })
 }
 
@@ -301,7 +301,7 @@ impl OpenConnection {
     /// Carries the connection's traffic until it ends, and reports its beginning and end to the
     /// application.
     async fn serve(self, shared: &EndpointShared) {
-        let Self { peer: id, role, fingerprint, connection, mut send, mut recv, place } = self;
+        let Self { peer: id, role, fingerprint, connection, mut send, mut recv, slot } = self;
         let peer = Arc::new(PeerConnection::default());
         refresh(&connection, &peer);
         let address = Some(connection.remote_address());
@@ -309,13 +309,13 @@ impl OpenConnection {
         let room = shared.connections.open(id, Arc::clone(&peer), connected);
         let bucket = Mutex::new(Bucket::new(shared.connections.limits.rate, Instant::now()));
         let reason = {
-            let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room, place.as_ref()));
+            let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room, slot.as_ref()));
             let datagrams_in = pin!(read_datagrams(shared, id, &connection, &peer));
             let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
             let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
             let metrics = pin!(keep_metrics(&connection, &peer));
             let hung_up = pin!(hang_up(shared, &connection, &peer));
-            let makes_room = pin!(make_room(&connection, place.as_ref()));
+            let makes_room = pin!(make_room(&connection, slot.as_ref()));
             tokio::select! {
                 reason = messages_in => reason,
                 reason = messages_out => reason,
@@ -382,14 +382,14 @@ async fn read_messages(
     connection: &Connection,
     recv: &mut RecvStream,
     room: &Notify,
-    place: Option<&Reservation>,
+    slot: Option<&Reservation>,
 ) -> DisconnectReason {
     let most = shared.connections.limits.unread_messages();
     loop {
         match wire::read_message(recv, shared.connections.limits.message).await {
             Ok(message) => {
-                if let Some(place) = place {
-                    place.keep();
+                if let Some(slot) = slot {
+                    slot.keep();
                 }
                 shared.connections.inbox.put_message(id, message, most, room).await;
             }
@@ -472,9 +472,9 @@ async fn hang_up(
 }
 
 /// Closes a silent connection that must make room for a newcomer.
-async fn make_room(connection: &Connection, place: Option<&Reservation>) -> DisconnectReason {
-    match place {
-        Some(place) => place.leaving().notified().await,
+async fn make_room(connection: &Connection, slot: Option<&Reservation>) -> DisconnectReason {
+    match slot {
+        Some(slot) => slot.leaving().notified().await,
         None => std::future::pending().await,
     }
     connection.close(code_of(DisconnectReason::Silent), &[]);

@@ -18,8 +18,8 @@ use super::connections::Connections;
 use super::driver::{self, Side};
 use super::identity::{Fingerprint, Identity, IdentityError};
 use super::invite::{Invite, Token};
-use super::places::Places;
 use super::queue::lock;
+use super::slots::Slots;
 use super::socket::Socket;
 use super::stats::PeerStats;
 
@@ -68,7 +68,7 @@ pub(super) struct EndpointShared {
     /// Notified when a guest is to reconnect.
     pub(super) reconnect: Notify,
     pub(super) access: Mutex<Arc<Access>>,
-    pub(super) places: Arc<Mutex<Places>>,
+    pub(super) slots: Arc<Mutex<Slots>>,
 }
 
 impl EndpointShared {
@@ -79,7 +79,7 @@ impl EndpointShared {
             stop: watch::Sender::new(false),
             reconnect: Notify::new(),
             access: Mutex::new(Arc::new(access)),
-            places: Arc::default(),
+            slots: Arc::default(),
         })
     }
 

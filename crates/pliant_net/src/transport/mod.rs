@@ -29,11 +29,11 @@ mod endpoint;
 mod identity;
 mod invite;
 mod mesh;
-mod places;
 mod port;
 mod queue;
 #[cfg(test)]
 mod queue_tests;
+mod slots;
 mod socket;
 mod stats;
 mod wire;

@@ -61,7 +61,7 @@ impl Session<'_, '_> {
             rate,
             jitter_ms: stats.jitter.as_secs_f64() * 1e3,
             repaired: self.host.is_none().then_some([stats.guessed, stats.recovered]),
-            requested_again: stats.nacks,
+            nacks: stats.nacks,
             snapshots: stats.snapshots,
             dropped: dropped.send_queue_full
                 + dropped.receive_queue_full

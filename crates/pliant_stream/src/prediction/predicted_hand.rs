@@ -156,7 +156,7 @@ impl PredictedHand {
     ///
     /// The streamed load is what steps without columns lack, as receivers make them. Where the host
     /// has columns, it is mostly the elastic force of these. Steps with columns lack as much less.
-    fn settle_columns(&mut self, copy: &mut BodyCopy, receiver: &Receiver) {
+    fn equilibrate_columns(&mut self, copy: &mut BodyCopy, receiver: &Receiver) {
         self.load.clear();
         self.load.extend_from_slice(receiver.load());
         let Some(plain) = &self.plain else {
@@ -332,7 +332,7 @@ impl PredictedHand {
             let mut copy = std::mem::take(&mut self.copy);
             replica::place(&mut copy.state, self.replica.model(), receiver.pose().as_ref());
             copy.contacts = receiver.contacts().cloned().unwrap_or_default();
-            self.settle_columns(&mut copy, receiver);
+            self.equilibrate_columns(&mut copy, receiver);
             self.copy = copy;
             self.visual.state.clone_from(&self.copy.state);
             self.visual.clear();
@@ -352,7 +352,7 @@ impl PredictedHand {
         self.take_shapes();
         let mut copy = std::mem::take(&mut self.copy);
         self.confirm(&mut copy, receiver, user, confirmed_frame);
-        self.settle_columns(&mut copy, receiver);
+        self.equilibrate_columns(&mut copy, receiver);
         for j in 1..=self.lead {
             self.one_step(&mut copy, receiver, user, j);
         }

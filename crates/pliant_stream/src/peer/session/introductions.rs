@@ -9,7 +9,7 @@ use super::{MAX_ADDRESS, MAX_PEERS, PeerEvent, PeerId, PeerMessage, PeerSession,
 use crate::StreamError;
 
 /// Shortest time between two lists that are sent.
-const TELL_EVERY: Duration = Duration::from_secs(2);
+const INTRODUCTION_INTERVAL: Duration = Duration::from_secs(2);
 /// Shortest time between two lists of one peer that are read. Messages may arrive in a bunch, but
 /// what a list tells is told again by the next one.
 const READ_EVERY: Duration = Duration::from_millis(500);
@@ -49,7 +49,7 @@ impl PeerSession {
         if !known.is_new || now < known.next {
             return;
         }
-        (known.is_new, known.next) = (false, now + TELL_EVERY);
+        (known.is_new, known.next) = (false, now + INTRODUCTION_INTERVAL);
         let message = PeerMessage::Others { others: known.list.clone() };
         let present: Vec<PeerId> =
             self.others.iter().filter(|(_, other)| other.user.is_some()).map(|(&peer, _)| peer).collect();

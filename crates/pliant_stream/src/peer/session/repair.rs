@@ -9,7 +9,7 @@ use crate::wire::{Datagram, InputTick, Inputs, MAX_NACK_RUN, MAX_NACK_RUNS, MAX_
 /// What a tick that is stepped again with contacts costs more than one without.
 const CONTACT_COST: u64 = 4;
 /// Pause between requests for the same tick.
-const REQUEST_AGAIN: Duration = Duration::from_millis(150);
+const REQUEST_INTERVAL: Duration = Duration::from_millis(150);
 
 impl PeerSession {
     /// Rolls back to the earliest tick for which a new input is known.
@@ -58,7 +58,7 @@ impl PeerSession {
             let mut runs: Vec<NackRun> = Vec::new();
             for tick in from..to {
                 let again =
-                    other.requested.get(&tick).is_some_and(|at| now.saturating_sub(*at) < REQUEST_AGAIN);
+                    other.requested.get(&tick).is_some_and(|at| now.saturating_sub(*at) < REQUEST_INTERVAL);
                 if inputs.at(tick).is_some() || again {
                     continue;
                 }

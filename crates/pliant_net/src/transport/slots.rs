@@ -1,4 +1,4 @@
-//! The places at a host's socket: who may take one, and who makes room for a newcomer.
+//! The slots at a host's socket: who may take one, and who makes room for a newcomer.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv6Addr};
@@ -15,11 +15,11 @@ const MAX_ADDRESSES: usize = 4096;
 
 /// The connections and handshakes of a host.
 ///
-/// A connection that has sent a message after its token is present, and keeps its place. All others
+/// A connection that has sent a message after its token is present, and keeps its slot. All others
 /// are silent: when there is no room, the oldest of them makes room for a newcomer. Arrivals are
 /// counted by address, so that nobody can make others leave again and again.
 #[derive(Debug, Default)]
-pub(super) struct Places {
+pub(super) struct Slots {
     addresses: BTreeMap<IpAddr, Arrivals>,
     /// By number, so that the oldest comes first.
     taken: BTreeMap<u64, Taken>,
@@ -31,7 +31,7 @@ struct Arrivals {
     /// How many more may arrive at the time `at`.
     left: f64,
     at: Instant,
-    places: usize,
+    slots: usize,
 }
 
 #[derive(Debug)]
@@ -50,20 +50,20 @@ fn network_of(address: IpAddr) -> IpAddr {
     }
 }
 
-impl Places {
+impl Slots {
     fn take(&mut self, limits: &Limits, now: Instant, address: IpAddr) -> Option<(u64, Arc<Notify>)> {
         let (address, most) = (network_of(address), limits.per_address.max(1));
         // All that there is room for may come twice at once, and then twice in four seconds.
         let (burst, rate) = (2.0 * most as f64, 0.5 * most as f64);
         self.forget(now, burst, rate);
-        let arrivals = self.addresses.entry(address).or_insert(Arrivals { left: burst, at: now, places: 0 });
+        let arrivals = self.addresses.entry(address).or_insert(Arrivals { left: burst, at: now, slots: 0 });
         arrivals.left = arrivals.left_at(now, burst, rate);
         arrivals.at = now;
         if arrivals.left < 1.0 {
             return None;
         }
         arrivals.left -= 1.0;
-        let is_full = arrivals.places >= most;
+        let is_full = arrivals.slots >= most;
         if is_full {
             self.make_room(address)?;
         }
@@ -71,7 +71,7 @@ impl Places {
             let most_silent = self.with_most_silent()?;
             self.make_room(most_silent)?;
         }
-        self.addresses.get_mut(&address)?.places += 1;
+        self.addresses.get_mut(&address)?.slots += 1;
         self.next += 1;
         let leave = Arc::new(Notify::new());
         self.taken.insert(self.next, Taken { address, present: false, leave: Arc::clone(&leave) });
@@ -99,18 +99,18 @@ impl Places {
     fn free(&mut self, id: u64) {
         let Some(taken) = self.taken.remove(&id) else { return };
         if let Some(arrivals) = self.addresses.get_mut(&taken.address) {
-            arrivals.places -= 1;
+            arrivals.slots -= 1;
         }
     }
 
-    /// Forgets addresses that have not come for a while, or that have no place.
+    /// Forgets addresses that have not come for a while, or that have no slot.
     fn forget(&mut self, now: Instant, burst: f64, rate: f64) {
         if self.addresses.len() < MAX_ADDRESSES {
             return;
         }
-        self.addresses.retain(|_, a| a.places > 0 || a.left_at(now, burst, rate) < burst);
+        self.addresses.retain(|_, a| a.slots > 0 || a.left_at(now, burst, rate) < burst);
         while self.addresses.len() >= MAX_ADDRESSES {
-            let idle = self.addresses.iter().filter(|(_, arrivals)| arrivals.places == 0);
+            let idle = self.addresses.iter().filter(|(_, arrivals)| arrivals.slots == 0);
             let Some(oldest) = idle.min_by_key(|(_, arrivals)| arrivals.at).map(|(&address, _)| address)
             else {
                 return;
@@ -126,24 +126,24 @@ impl Arrivals {
     }
 }
 
-/// A place, which is free again when this value is dropped.
+/// A slot, which is free again when this value is dropped.
 #[derive(Debug)]
 pub(super) struct Reservation {
-    places: Arc<Mutex<Places>>,
+    slots: Arc<Mutex<Slots>>,
     id: u64,
     leave: Arc<Notify>,
 }
 
 impl Reservation {
-    /// Takes a place for an arrival from an address. `None`: there is none.
-    pub(super) fn take(places: &Arc<Mutex<Places>>, limits: &Limits, address: IpAddr) -> Option<Self> {
-        let (id, leave) = lock(places).take(limits, Instant::now(), address)?;
-        Some(Self { places: Arc::clone(places), id, leave })
+    /// Takes a slot for an arrival from an address. `None`: there is none.
+    pub(super) fn take(slots: &Arc<Mutex<Slots>>, limits: &Limits, address: IpAddr) -> Option<Self> {
+        let (id, leave) = lock(slots).take(limits, Instant::now(), address)?;
+        Some(Self { slots: Arc::clone(slots), id, leave })
     }
 
-    /// Keeps the place from now on.
+    /// Keeps the slot from now on.
     pub(super) fn keep(&self) {
-        if let Some(taken) = lock(&self.places).taken.get_mut(&self.id) {
+        if let Some(taken) = lock(&self.slots).taken.get_mut(&self.id) {
             taken.present = true;
         }
     }
@@ -156,7 +156,7 @@ impl Reservation {
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        lock(&self.places).free(self.id);
+        lock(&self.slots).free(self.id);
     }
 }
 
@@ -173,44 +173,44 @@ mod tests {
     #[test]
     fn silent_ones_make_room_and_present_ones_do_not() {
         let limits = Limits { peers: 4, per_address: 3, ..Limits::host() };
-        let (mut places, now) = (Places::default(), Instant::now());
+        let (mut slots, now) = (Slots::default(), Instant::now());
         let (here, there) = (address("192.0.2.1"), address("192.0.2.2"));
-        let mut take = |from| places.take(&limits, now, from).map(|(id, _)| id);
+        let mut take = |from| slots.take(&limits, now, from).map(|(id, _)| id);
         let first: Vec<u64> = (0..3).map(|_| take(here).unwrap()).collect();
         assert!(take(there).is_some());
         // Full, and the silent ones of the address with the most of them make room.
         assert!(take(there).is_some());
-        assert!(!places.taken.contains_key(&first[0]) && places.taken.len() == 4);
-        for taken in places.taken.values_mut() {
+        assert!(!slots.taken.contains_key(&first[0]) && slots.taken.len() == 4);
+        for taken in slots.taken.values_mut() {
             taken.present = true;
         }
-        assert!(places.take(&limits, now, here).is_none(), "all are present");
-        places.free(first[1]);
-        assert!(places.take(&limits, now, here).is_some());
+        assert!(slots.take(&limits, now, here).is_none(), "all are present");
+        slots.free(first[1]);
+        assert!(slots.take(&limits, now, here).is_some());
     }
 
     #[test]
     fn arrivals_are_counted_by_address_and_by_network() {
         let limits = Limits { per_address: 8, ..Limits::host() };
-        let (mut places, now) = (Places::default(), Instant::now());
-        let come = |places: &mut Places, from: &str, now| {
-            (0..100).filter(|_| places.take(&limits, now, address(from)).is_some()).count()
+        let (mut slots, now) = (Slots::default(), Instant::now());
+        let come = |slots: &mut Slots, from: &str, now| {
+            (0..100).filter(|_| slots.take(&limits, now, address(from)).is_some()).count()
         };
-        assert_eq!(come(&mut places, "192.0.2.1", now), 16);
-        assert_eq!(come(&mut places, "::ffff:192.0.2.1", now), 0, "the same address");
-        assert_eq!(come(&mut places, "192.0.2.2", now), 16);
-        assert_eq!(come(&mut places, "2001:db8::1", now), 16);
-        assert_eq!(come(&mut places, "2001:db8::ffff:1:2:3", now), 0, "the same network");
-        assert_eq!(come(&mut places, "2001:db8:0:1::1", now), 16);
-        assert_eq!(come(&mut places, "192.0.2.1", now + Duration::from_secs(1)), 4);
-        assert_eq!(places.taken.len(), 4 * 8, "and no address has more places than it may");
+        assert_eq!(come(&mut slots, "192.0.2.1", now), 16);
+        assert_eq!(come(&mut slots, "::ffff:192.0.2.1", now), 0, "the same address");
+        assert_eq!(come(&mut slots, "192.0.2.2", now), 16);
+        assert_eq!(come(&mut slots, "2001:db8::1", now), 16);
+        assert_eq!(come(&mut slots, "2001:db8::ffff:1:2:3", now), 0, "the same network");
+        assert_eq!(come(&mut slots, "2001:db8:0:1::1", now), 16);
+        assert_eq!(come(&mut slots, "192.0.2.1", now + Duration::from_secs(1)), 4);
+        assert_eq!(slots.taken.len(), 4 * 8, "and no address has more slots than it may");
         // The number of addresses that are remembered is bounded.
         for k in 0..10_000_u128 {
             let from = IpAddr::V6(Ipv6Addr::from_bits((0x2001_0db9 << 96) + (k << 64)));
-            if let Some((id, _)) = places.take(&limits, now, from) {
-                places.free(id);
+            if let Some((id, _)) = slots.take(&limits, now, from) {
+                slots.free(id);
             }
         }
-        assert!(places.addresses.len() <= MAX_ADDRESSES, "{}", places.addresses.len());
+        assert!(slots.addresses.len() <= MAX_ADDRESSES, "{}", slots.addresses.len());
     }
 }
