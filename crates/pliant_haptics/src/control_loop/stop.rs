@@ -26,8 +26,8 @@ impl StopSwitch {
         self.0.load(Ordering::Acquire)
     }
 
-    /// Releases the switch, and notifies the loop to unlatch by `notify`. Returns `false` and changes
-    /// nothing if the loop's queue has no room for it.
+    /// Releases the switch, and notifies the loop to unlatch by `notify`. Returns `false` and
+    /// changes nothing if the loop's queue has no room for it.
     pub(crate) fn reset(&self, has_room: bool, notify: impl FnOnce() -> bool) -> bool {
         if !has_room {
             return false;
