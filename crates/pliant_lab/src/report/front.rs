@@ -186,7 +186,7 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
     let size = [1.0, 0.2, 0.2];
     let held = |element, modes| config(element, modes, vec![anchor(0, 1e-9)]);
     progress.report("front", 0.0);
-    let meshes = if quick { [[4, 2, 2], [8, 2, 2]] } else { [[8, 2, 2], [16, 4, 4]] };
+    let meshes = if quick { [[4, 2, 2], [8, 4, 4]] } else { [[8, 2, 2], [16, 4, 4]] };
     // The coarser mesh first, and ten-node elements before four-node ones.
     let mut models = Vec::new();
     for cells in meshes {
@@ -219,8 +219,8 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
             },
         )
     };
-    let truth = fine(if quick { [16, 4, 4] } else { [32, 8, 8] }, 3840.0)?;
-    let between = fine(if quick { [8, 2, 2] } else { [24, 6, 6] }, 1920.0)?;
+    let truth = fine(if quick { [16, 8, 8] } else { [32, 8, 8] }, 3840.0)?;
+    let between = fine(if quick { [12, 6, 6] } else { [24, 6, 6] }, 1920.0)?;
     let shape_of = |run: &FrontRun| relative(run.places.iter().flatten(), truth.places.iter().flatten());
     let force_of = |run: &FrontRun| relative(run.force.iter(), truth.force.iter());
     let own = [shape_of(&between), force_of(&between)];
@@ -253,7 +253,7 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
                             shape: shape_of(&run),
                             force: force_of(&run),
                             bake: *bake,
-                            default: *cells == [8, 2, 2]
+                            default: *cells == meshes[0]
                                 && *element == Element::Tet10
                                 && integrator == Integrator::Exact
                                 && rate == 60.0
