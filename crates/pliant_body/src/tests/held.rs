@@ -142,7 +142,7 @@ fn a_body_of_fewer_coordinates_or_of_linear_elasticity_gets_no_shapes() {
         },
         (),
     );
-    let linear = spawn_with(&mut app, bar(), |_| (), ());
+    let linear = spawn_with(&mut app, bar(), |body| body.settings.elasticity = Elasticity::Linear, ());
     let target = DVec3::new(1.0, 0.16, 0.16);
     for body in [few, linear] {
         hold(&mut app, body, target);
