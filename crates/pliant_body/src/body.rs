@@ -11,7 +11,8 @@ use bevy::{
     reflect::reflect_remote,
 };
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings,
+    Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, ObstacleShape, Precision, Relaxation,
+    StepError, StepSettings,
 };
 
 use crate::{BodyGravityScale, Inertia, ModalAsset, VisualState, grab::GrabHold, gravity::Pull};
@@ -324,6 +325,27 @@ impl BodyState {
     pub fn body_mut(&mut self) -> &mut Body {
         self.wake();
         &mut self.body
+    }
+
+    /// Gives the body its obstacles ([`Body::set_obstacles`]). A resting body wakes only if it
+    /// touches one of `moved`, or may do so before or after: these are indices, with how near each
+    /// is near (m).
+    ///
+    /// # Errors
+    /// Returns those of [`Body::set_obstacles`]. The body then keeps its obstacles.
+    pub fn set_obstacles(
+        &mut self,
+        obstacles: Vec<Arc<dyn ObstacleShape>>,
+        moved: &[(usize, f64)],
+    ) -> Result<(), StepError> {
+        let meets = |body: &Body| moved.iter().any(|&(index, near)| body.may_touch(index, near));
+        // What the body rested on may be gone afterwards.
+        let left = self.resting && meets(&self.body);
+        self.body.set_obstacles(obstacles)?;
+        if left || self.resting && meets(&self.body) {
+            self.wake();
+        }
+        Ok(())
     }
 
     /// Returns the solver's identifier of a [`Grab`](crate::Grab) entity's grab, for queries to

@@ -176,12 +176,13 @@ pub(crate) fn place_obstacles(
     let mut all: Vec<_> = obstacles.iter().filter(|(_, motion, _)| motion.sound).collect();
     all.sort_by_key(|(entity, ..)| *entity);
     let changed = |layers: &Option<Ref<ContactLayers>>| layers.as_ref().is_some_and(Ref::is_changed);
-    let stirred = !last.iter().eq(all.iter().map(|(entity, ..)| entity))
-        || all.iter().any(|(_, motion, layers)| motion.changed || changed(layers));
-    if stirred {
+    let listed = !last.iter().eq(all.iter().map(|(entity, ..)| entity));
+    if listed {
         last.clear();
         last.extend(all.iter().map(|(entity, ..)| *entity));
     }
+    let stirred: Vec<_> =
+        all.iter().filter(|(_, motion, layers)| motion.changed || changed(layers)).collect();
     for (entity, probe, mut state) in &mut probes {
         if let Err(error) = give_probe(&all, probe, &mut state) {
             commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
@@ -189,7 +190,8 @@ pub(crate) fn place_obstacles(
     }
     for (entity, mut state, mut nearby, driven, layers, friction) in &mut bodies {
         let touched = changed(&layers) || friction.as_ref().is_some_and(Ref::is_changed);
-        if state.is_resting() && !stirred && !touched {
+        let look = !state.is_resting() || touched || listed;
+        if !look && stirred.is_empty() {
             continue;
         }
         let nearby = &mut *nearby;
@@ -197,7 +199,15 @@ pub(crate) fn place_obstacles(
         let local = *driven == Driven::Local;
         let (body, scale) = (state.body(), state.scale());
         let center = Vector3::from(body.frame().to_world(Vector3::from(body.model().center_of_mass())));
-        let reach = 2.0 * body.model().size() + 2.0 * step * Vector3::from(body.frame().velocity()).norm();
+        let size = body.model().size();
+        let reach = 2.0 * size + 2.0 * step * Vector3::from(body.frame().velocity()).norm();
+        let known = |entity: &Entity| nearby.slots.contains(&Some(*entity));
+        let stirs = |(entity, motion, _): &&(Entity, &Motion, Option<Ref<ContactLayers>>)| {
+            known(entity) || motion.distance(scale, &center) <= reach
+        };
+        if !look && !stirred.iter().any(stirs) {
+            continue;
+        }
         let near: Vec<(Entity, &Motion)> = all
             .iter()
             .filter(|(_, motion, other)| {
@@ -209,21 +219,27 @@ pub(crate) fn place_obstacles(
             .collect();
         let find = |entity: Entity| near.binary_search_by_key(&entity, |(entity, _)| *entity).ok();
         let mut changed = body.contacts().obstacles().len() != nearby.slots.len();
-        for slot in &mut nearby.slots {
+        // What has changed, and how near it wakes a resting body.
+        let mut moved: Vec<(usize, f64)> = Vec::new();
+        for (index, slot) in nearby.slots.iter_mut().enumerate() {
             if slot.is_some_and(|entity| find(entity).is_none()) {
                 (*slot, changed) = (None, true);
+                moved.push((index, 0.0));
             }
         }
         for (entity, motion) in &near {
-            changed |= motion.changed;
-            if nearby.slots.contains(&Some(*entity)) {
+            let known = nearby.slots.iter().position(|slot| *slot == Some(*entity));
+            if known.is_some() && !motion.changed {
                 continue;
             }
             changed = true;
-            match nearby.slots.iter_mut().find(|slot| slot.is_none()) {
-                Some(slot) => *slot = Some(*entity),
-                None => nearby.slots.push(Some(*entity)),
+            let free = || nearby.slots.iter().position(Option::is_none);
+            let index = known.or_else(free).unwrap_or(nearby.slots.len());
+            if index == nearby.slots.len() {
+                nearby.slots.push(None);
             }
+            nearby.slots[index] = Some(*entity);
+            moved.push((index, step * motion.speed(scale, &center) + MARGIN * size));
         }
         if near.is_empty() {
             nearby.slots.clear();
@@ -233,7 +249,11 @@ pub(crate) fn place_obstacles(
                 Some(index) => near[index].1.obstacle(scale),
                 None => Arc::new(Nothing),
             });
-            if let Err(error) = state.body_mut().set_obstacles(list.collect()) {
+            let given = state.bypass_change_detection().set_obstacles(list.collect(), &moved);
+            if !state.is_resting() {
+                state.set_changed();
+            }
+            if let Err(error) = given {
                 commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
             }
         }
@@ -250,6 +270,10 @@ pub(crate) fn place_obstacles(
         }
     }
 }
+
+/// Distance within which an obstacle that moves wakes a resting body, as a share of its size,
+/// besides the obstacle's way in a step.
+const MARGIN: f64 = 0.01;
 
 /// Farthest distance of an obstacle that a probe is given, m, besides its way in a step.
 const NEAR: f64 = 0.1;

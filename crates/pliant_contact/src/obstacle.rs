@@ -266,6 +266,12 @@ impl Motion {
         self.visit(scale, Share)
     }
 
+    /// Speed of the obstacle's material at a point, m/s, in the same world.
+    pub(crate) fn speed(&self, scale: f64, point: &Vector3<f64>) -> f64 {
+        let arm = scale * DVec3::from_array((*point).into()) - self.position;
+        (self.velocity + self.spin.cross(arm)).length() / scale
+    }
+
     /// Distance of a point to the obstacle, m, in the same world.
     pub(crate) fn distance(&self, scale: f64, point: &Vector3<f64>) -> f64 {
         self.visit(scale, Distance(point))

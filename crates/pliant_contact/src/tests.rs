@@ -213,6 +213,36 @@ fn a_body_far_from_everything_has_no_contact_work() {
 }
 
 #[test]
+fn a_box_that_moves_beside_a_resting_body_does_not_wake_it_and_one_that_comes_to_it_does() {
+    let mut app = app();
+    app.world_mut().spawn((Obstacle::Floor, Transform::default()));
+    let half = Vec3::splat(0.1);
+    let side = app.world_mut().spawn((Obstacle::Box { half }, Transform::from_xyz(0.3, 0.1, 0.0))).id();
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.101, 0.0), ());
+    seconds(&mut app, 3.0);
+    assert!(state(&app, body).is_resting());
+    let mut awake = 0;
+    for tick in 0..60 {
+        let z = 0.1 * (0.3 * f64::from(tick)).sin() as f32;
+        app.world_mut().get_mut::<Transform>(side).unwrap().translation.z = z;
+        app.update();
+        awake += usize::from(!state(&app, body).is_resting());
+    }
+    println!("awake for {awake} of 60 ticks");
+    assert_eq!(awake, 0);
+    // The box is where it is when the body wakes, and not where it was.
+    for tick in 0..60 {
+        app.world_mut().get_mut::<Transform>(side).unwrap().translation.x = 0.3 - 0.002 * tick as f32;
+        app.update();
+    }
+    // The face of the box has come to 0.082 m, so the body's center is 0.018 m away.
+    let pushed = center(&app, body).x;
+    println!("pushed by {pushed} m");
+    assert!((pushed + 0.018).abs() < 2e-3, "{pushed}");
+    assert!(app.world().resource::<Told>().refused.is_empty());
+}
+
+#[test]
 fn a_hand_presses_a_body_on_a_table() {
     let mut app = app();
     app.world_mut().spawn(Obstacle::Floor);

@@ -9,6 +9,7 @@ use nalgebra::Vector3;
 use crate::{
     Contacts, Frame, FrameMotion, GrabConfig, Hand, HeldPlace, Hold, Kernel, Load, ModalModel, ObstacleShape,
     Precision, State, StepError, StepReport, StepSettings,
+    contact::{Memory, Touched},
     error::finite,
     step::group::{Parts, View},
 };
@@ -445,6 +446,25 @@ impl Body {
         }
         let Some(sites) = &self.contacts.places else { return false };
         self.kernel.shape(sites, &self.state, None, None).is_near(point, within)
+    }
+
+    /// Whether the body has touched the obstacle of an index in the last step, or comes within a
+    /// distance (m) of it. It may say so of one that is a little farther, and does so of all before
+    /// the body has touched its first.
+    pub fn may_touch(&self, obstacle: usize, within: f64) -> bool {
+        let touched = |memory: &Memory| memory.other == Touched::Obstacle(obstacle);
+        if self.contacts.memory.iter().any(touched) {
+            return true;
+        }
+        let Some(obstacle) = self.contacts.obstacles().get(obstacle) else { return false };
+        let Some(sites) = &self.contacts.places else { return true };
+        let frame = &self.state.frame;
+        let near = within + sites.bound(&self.state.q);
+        // Comparisons with no number are false, and such a body is taken for near.
+        !sites.sites.iter().all(|site| {
+            let place = frame.to_world(site.rest(&site.outward));
+            obstacle.at(&place).distance > near + site.slides
+        })
     }
 
     pub(crate) fn contacts_mut(&mut self) -> &mut Contacts {

@@ -326,10 +326,11 @@ impl Islands {
         }
     }
 
-    /// Finds the bodies near each rigid body that gives way.
+    /// Finds the bodies near each rigid body that gives way. A resting one must touch it or be
+    /// about to, so that what moves beside it does not wake it.
     fn find_pushed(&mut self, bodies: &[Together<'_>], h: f64) {
         for rigid in &mut self.rigids {
-            rigid.forget();
+            rigid.begin();
             rigid.near.clear();
         }
         if self.rigids.is_empty() {
@@ -339,7 +340,9 @@ impl Islands {
             let body = &*together.body;
             let obstacles = body.contacts().obstacles().iter();
             let mut ball = None;
-            for (obstacle, key) in obstacles.filter_map(|obstacle| Some((obstacle, obstacle.rigid()?))) {
+            let named = obstacles.enumerate();
+            let named = named.filter_map(|(slot, obstacle)| Some((slot, obstacle, obstacle.rigid()?)));
+            for (slot, obstacle, key) in named {
                 let rigid = self.rigids.iter_mut().find(|rigid| rigid.key == key && rigid.is_sound());
                 let Some(rigid) = rigid.filter(|_| body.config().step == h) else { continue };
                 let ball = ball.get_or_insert_with(|| Ball::of(index, body));
@@ -347,14 +350,18 @@ impl Islands {
                     continue;
                 }
                 let way = h * (ball.velocity.norm() + obstacle.velocity(&ball.center).norm());
-                if obstacle.at(&ball.center).distance <= ball.radius + way && !rigid.near.contains(&index) {
+                if obstacle.at(&ball.center).distance <= ball.radius + way
+                    && !rigid.near.contains(&index)
+                    && (!together.resting || body.may_touch(slot, way + MARGIN * body.model().size()))
+                {
                     rigid.near.push(index);
                 }
             }
         }
     }
 
-    /// Wakes the islands of which a member moves or is touched by a probe or a rigid body.
+    /// Wakes the islands of which a member moves or is touched by a probe or a rigid body that
+    /// moves.
     fn wake(&mut self, bodies: &mut [Together<'_>], probes: &[Probe]) {
         // The entry of each island's first body says whether one moves.
         self.moves.clear();
@@ -362,7 +369,8 @@ impl Islands {
         for together in bodies.iter() {
             self.moves[together.island] |= !together.resting;
         }
-        let rigids = self.rigids.iter().flat_map(|rigid| &rigid.near);
+        let awake = self.rigids.iter().filter(|rigid| !rigid.rests);
+        let rigids = awake.flat_map(|rigid| &rigid.near);
         for &near in probes.iter().flat_map(|probe| &probe.near).chain(rigids) {
             self.moves[bodies[near].island] = true;
         }

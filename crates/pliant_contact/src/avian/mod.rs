@@ -223,6 +223,7 @@ impl BodyItem<'_, '_> {
             acceleration: (self.acceleration(gravity) / scale).into(),
             inverse_mass: self.inverse_mass().into(),
             inverse_inertia: inertia.to_cols_array_2d(),
+            rests: self.sleeps,
             ..Rigid::default()
         }
     }
@@ -344,6 +345,7 @@ struct Places(Vec<Vec<(ContactId, usize, usize)>>);
 /// them, up to [`MOST`].
 fn gather(
     gravity: Res<Gravity>,
+    (time, substeps): (Res<Time>, Res<SubstepCount>),
     collisions: Collisions,
     bodies: Query<Body>,
     motions: Query<&Motion>,
@@ -354,6 +356,8 @@ fn gather(
     list.0.clear();
     places.0.clear();
     let mut all: Vec<(Rigid, Vec<(ContactId, usize, usize)>)> = Vec::new();
+    // Avian has the impulses of its last substep.
+    let substep = time.delta_secs_f64() / f64::from(substeps.0.max(1));
     let mut found: BTreeSet<(u64, Entity)> = BTreeSet::new();
     for (state, nearby) in soft.iter().filter(|(state, _)| !state.is_resting()) {
         let near = nearby.slots.iter().flatten().filter_map(|entity| motions.get(*entity).ok()?.rigid);
@@ -403,7 +407,7 @@ fn gather(
                         gap: f64::from(-point.penetration).max(0.0) / scale,
                         friction: manifold.friction.into(),
                         velocity: (moved / scale).into(),
-                        force: 0.0,
+                        force: f64::from(point.warm_start_normal_impulse) / substep / scale,
                     });
                 }
             }

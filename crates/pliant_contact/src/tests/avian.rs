@@ -132,6 +132,34 @@ fn crates_of_all_masses_rest_on_a_body() {
 }
 
 #[test]
+fn a_crate_of_a_hundred_times_the_mass_rests_on_a_stiffer_body() {
+    let mut mesh = pliant_mesh::shapes::bar([3, 3, 3], [EDGE; 3]).unwrap();
+    mesh.nodes.iter_mut().flatten().for_each(|x| *x -= 0.5 * EDGE);
+    let damping = pliant_modal::Damping::Ratio(0.1);
+    let config = pliant_bake::BakeConfig { modes: 12, young: 1e8, damping, ..Default::default() };
+    let model = Arc::new(pliant_bake::bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model);
+    let mass = 100.0 * model.mass();
+    let mut app = earth();
+    app.world_mut().spawn(Obstacle::Floor);
+    let asset = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(model));
+    let mut body = ModalBody::new(asset);
+    body.settings.gravity = [0.0, -GRAVITY, 0.0];
+    let body = app.world_mut().spawn((body, Transform::from_xyz(0.0, 0.1005, 0.0))).id();
+    let rigid = brick(&mut app, Vec3::new(0.01, 0.252, 0.02), Vec3::new(0.2, 0.1, 0.2), mass);
+    seconds(&mut app, 8.0);
+    let (mut most, mut sum) = (0.0f64, 0.0);
+    for _ in 0..120 {
+        app.update();
+        most = most.max(velocity(&app, rigid).length());
+        let of = contacts(&app, body).0.iter().filter(|c| c.other == rigid);
+        sum += of.map(|c| c.force.y).sum::<f64>() / 120.0;
+    }
+    let share = sum / (-mass * GRAVITY);
+    println!("speed {most:e} m/s, force {share:e} of m g, at {}", place(&app, rigid));
+    assert!(most < 1e-2 && (share - 1.0).abs() < 0.01 && place(&app, rigid).y > 0.24, "{most} {share}");
+}
+
+#[test]
 fn a_body_rests_on_crates_of_all_masses_on_a_floor() {
     for ratio in [0.1, 1.0, 10.0, 100.0] {
         let mut app = earth();
@@ -265,6 +293,33 @@ fn a_crate_that_no_body_touches_sleeps_on_and_lets_its_neighbor_rest() {
         assert!(app.world().get::<Sleeping>(rigid).is_some());
     }
     assert!(listed && !contacts(&app, body).touches(rigid) && state(&app, body).is_resting());
+}
+
+/// Neither one that slides past nor one that lies still near it, for as long as it is awake.
+#[test]
+fn a_crate_that_moves_beside_a_resting_body_does_not_wake_it() {
+    let mut app = earth();
+    let floor = (RigidBody::Static, Collider::half_space(Vec3::Y));
+    app.world_mut().spawn((floor, Transform::default()));
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.101, 0.0), ());
+    seconds(&mut app, 3.0);
+    assert!(state(&app, body).is_resting());
+    let rigid = brick(&mut app, Vec3::new(0.3, 0.101, -0.3), Vec3::splat(0.2), 4.0);
+    app.world_mut().entity_mut(rigid).insert(LinearVelocity(Vec3::new(0.0, 0.0, 2.0)));
+    let mut awake = 0;
+    for _ in 0..30 {
+        app.update();
+        awake += usize::from(!state(&app, body).is_resting());
+    }
+    println!("awake for {awake} of 30 ticks");
+    assert!(velocity(&app, rigid).length() < 2.0, "it has slid");
+    assert_eq!(awake, 0);
+    // One that comes to it does.
+    app.world_mut().entity_mut(rigid).insert(LinearVelocity(Vec3::ZERO));
+    let way = DVec3::from(state(&app, body).body().frame().center()) - place(&app, rigid);
+    app.world_mut().entity_mut(rigid).insert(LinearVelocity(3.0 * way.normalize().as_vec3()));
+    seconds(&mut app, 0.5);
+    assert!(center(&app, body).length() > 0.11, "{}", center(&app, body));
 }
 
 #[test]

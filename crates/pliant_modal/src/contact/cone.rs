@@ -1,6 +1,6 @@
 //! The exact solution of one contact with Coulomb friction.
 
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix3, RowVector3, Vector2, Vector3};
 
 /// Result of [`solve`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -93,6 +93,38 @@ pub(crate) fn solve(
     }
     let n = normal(&slip);
     (Vector3::new(n, friction * n * slip[0], friction * n * slip[1]), Status::Slip)
+}
+
+/// Derivative of the force of [`solve`] by `-free`, N/m, where the surface slides by `slid` (m)
+/// against its force. It is exact where the response does not couple normal and tangents.
+pub(super) fn stiffness(
+    response: &Matrix3<f64>,
+    force: &Vector3<f64>,
+    slid: f64,
+    status: Status,
+) -> Matrix3<f64> {
+    match status {
+        Status::Open => Matrix3::zeros(),
+        Status::Stick => response.try_inverse().unwrap_or_else(Matrix3::zeros),
+        Status::Slip => {
+            let along = force / force[0];
+            let soft = (response.row(0) * along)[0];
+            if !(along.iter().all(|x| x.is_finite()) && soft > 0.0) {
+                return Matrix3::zeros();
+            }
+            let mut stiffness = along * RowVector3::new(1.0 / soft, 0.0, 0.0);
+            let friction = force[1].hypot(force[2]);
+            if friction > 0.0 {
+                // The slip turns with the way across it.
+                let across = Vector3::new(0.0, -force[2], force[1]) / friction;
+                let soft = across.dot(&(response * across)) + slid / friction;
+                if soft > 0.0 {
+                    stiffness += across * across.transpose() / soft;
+                }
+            }
+            stiffness
+        }
+    }
 }
 
 #[cfg(test)]

@@ -139,6 +139,8 @@ pub(crate) struct ContactPoint {
     pub(crate) pushed: Vector3<f64>,
     pub(crate) force: Vector3<f64>,
     pub(super) status: Status,
+    /// How far the surface slides, m.
+    pub(super) slid: f64,
     /// Derivative of the site's position by the six numbers of its patch, world axes: at the
     /// beginning of the step, and its mean over the step, by which forces act on the modes. The
     /// mean stays as the first computed step has it.
@@ -180,6 +182,7 @@ impl ContactPoint {
             pushed: zero,
             force: zero,
             status: Status::Open,
+            slid: 0.0,
             tangent: Tangent::zeros(),
             mean: None,
             arm: zero,

@@ -29,6 +29,8 @@ pub struct Rigid {
     pub inverse_mass: [f64; 3],
     /// Inverse inertia about the center of mass, 1/(kg m^2), world axes.
     pub inverse_inertia: [[f64; 3]; 3],
+    /// Whether the body sleeps in its engine. Then it wakes no body. Default: false.
+    pub rests: bool,
     /// Where the body touches others of its engine.
     pub supports: Vec<Support>,
     /// Set by a step: mean force of the contacts, N.
@@ -64,7 +66,8 @@ pub struct Support {
     pub friction: f64,
     /// Velocity of the other's material there, m/s. It counts only if the other does not give way.
     pub velocity: [f64; 3],
-    /// Set by a step: force along the normal, N.
+    /// Force along the normal, N: what holds the body before a step, as far as it is known, and
+    /// set by a step.
     pub force: f64,
 }
 
@@ -169,9 +172,14 @@ impl Rigid {
 
     /// Forgets what the last step has set.
     pub(crate) fn forget(&mut self) {
+        self.begin();
+        self.supports.iter_mut().for_each(|support| support.force = 0.0);
+    }
+
+    /// Forgets what the last step has set, but not the forces of the supports.
+    pub(crate) fn begin(&mut self) {
         (self.force, self.torque, self.weight) = ([0.0; 3], [0.0; 3], 1.0);
         self.is_held = false;
-        self.supports.iter_mut().for_each(|support| support.force = 0.0);
         (self.way, self.turn) = (Vector3::zeros(), Vector3::zeros());
     }
 }

@@ -63,6 +63,10 @@ pub(crate) struct Touching {
     full: Vec<f64>,
     right: Vec<f64>,
     unknowns: Vec<Span>,
+    /// Coordinates of Newton's method, those before its step, and what is off balance there.
+    z: Vec<f64>,
+    before: Vec<f64>,
+    off_balance: Vec<f64>,
     /// Responses of all points to forces at all points, by rows, where they are few.
     responses: Vec<f64>,
     /// Marks of the sites that have a point with the current obstacle or body.
@@ -73,6 +77,8 @@ pub(crate) struct Touching {
     pub(crate) clear: Vec<Clearance>,
     spare: Vec<Clearance>,
     pub(crate) looks: Vec<Look>,
+    /// Forces of the supports of all rigid bodies at the beginning of the step, N.
+    pub(crate) supports: Vec<f64>,
     /// The points whose sites belong to the other body of the current look, with force: where they
     /// touch, m.
     pub(crate) covered: Vec<Vector3<f64>>,
@@ -84,6 +90,9 @@ impl Touching {
     /// Largest number of direct solves, and of sweeps before each.
     const TURNS: usize = 12;
     const SWEEPS: usize = 3;
+
+    /// Largest number of steps of Newton's method.
+    const DESCENTS: usize = 24;
 
     /// Largest number of coordinates, and of multiplications, of a direct solve.
     const MAX_WIDTH: usize = 512;
@@ -105,7 +114,9 @@ impl Touching {
         reserve(&mut self.rows, 3 * points * width);
         reserve(&mut self.spans, 1);
         reserve(&mut self.sum, width);
-        reserve(&mut self.right, width);
+        for list in [&mut self.right, &mut self.z, &mut self.before, &mut self.off_balance] {
+            reserve(list, width);
+        }
         reserve(&mut self.full, width * width);
         reserve(&mut self.unknowns, points);
         reserve(&mut self.responses, width * width);
@@ -225,7 +236,8 @@ impl Touching {
         if few {
             self.fill_responses();
         }
-        let mut direct = few || self.couple();
+        let affordable = self.couple();
+        let mut direct = few || affordable;
         let mut last = f64::INFINITY;
         for turn in 0..Self::TURNS {
             let mut change = 0.0;
@@ -236,9 +248,13 @@ impl Touching {
                     return;
                 }
             }
-            if change > last {
-                // The set of points that slide does not settle. Sweeps alone contract.
-                direct &= turn < 3;
+            if change > last && turn >= 3 && direct {
+                // The set of points that slide does not settle.
+                if affordable && turn + 1 < Self::TURNS && self.descend(enough) {
+                    return;
+                }
+                // Sweeps alone contract.
+                direct = false;
             }
             last = change;
             if direct && turn + 1 < Self::TURNS {
@@ -295,15 +311,7 @@ impl Touching {
         for i in 0..count {
             let i = if back { count - 1 - i } else { i };
             let (point, sides) = (&mut self.points[i], &self.sides[i]);
-            let mut moved = Vector3::zeros();
-            for side in sides.iter().flatten() {
-                let span = &self.spans[side.member];
-                let sum = &self.sum[span.start..span.start + span.width];
-                let rows = &self.rows[side.rows..side.rows + 3 * span.width];
-                for (moved, row) in moved.iter_mut().zip(rows.chunks_exact(span.width)) {
-                    *moved += dot(row, sum);
-                }
-            }
+            let moved = along(&self.spans, &self.rows, sides, &self.sum);
             // The gap if this point had no force.
             let free = point.off + moved - (point.block - point.local) * point.force;
             let (force, status) = cone::solve(&point.block, &free, point.friction, &point.force);
@@ -327,11 +335,8 @@ impl Touching {
     /// inverts its compliance. The unknown is `z`, which is as long as the bodies have coordinates.
     /// Its matrix couples only bodies that touch, and is factored within that envelope.
     fn solve_directly(&mut self) {
-        let width = self.width();
-        self.full.clear();
-        self.full.resize(width * width, 0.0);
         self.right.clear();
-        self.right.resize(width, 0.0);
+        self.right.resize(self.width(), 0.0);
         for (point, sides) in self.points.iter_mut().zip(&self.sides) {
             let stiffness = match point.status {
                 Status::Open => Matrix3::zeros(),
@@ -352,7 +357,29 @@ impl Touching {
             for side in sides.iter().flatten() {
                 add(&self.spans[side.member], &self.rows, side, &pull, &mut self.right);
             }
+        }
+        self.fill_matrix();
+        if !eliminate(&mut self.full, &mut self.right, &self.spans) {
+            return;
+        }
+        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
             if point.status == Status::Open {
+                continue;
+            }
+            let gap = point.off + along(&self.spans, &self.rows, sides, &self.right);
+            let force = -(point.stiffness * gap);
+            point.force = if force[0] > 0.0 { force } else { Vector3::zeros() };
+        }
+        self.sum_changes();
+    }
+
+    /// Computes `1 + sum rows^T stiffness rows`.
+    fn fill_matrix(&mut self) {
+        let width = self.width();
+        self.full.clear();
+        self.full.resize(width * width, 0.0);
+        for (point, sides) in self.points.iter().zip(&self.sides) {
+            if point.stiffness == Matrix3::zeros() {
                 continue;
             }
             for side in sides.iter().flatten() {
@@ -360,7 +387,7 @@ impl Touching {
                 let row = |axis: usize| &self.rows[side.rows + axis * span.width..][..span.width];
                 let [a, b, c] = [row(0), row(1), row(2)];
                 for i in 0..span.width {
-                    let [x, y, z] = *(stiffness.tr_mul(&Vector3::new(a[i], b[i], c[i]))).as_ref();
+                    let [x, y, z] = *(point.stiffness.tr_mul(&Vector3::new(a[i], b[i], c[i]))).as_ref();
                     let out = &mut self.full[(span.start + i) * width..][..width];
                     for other in sides.iter().flatten() {
                         let there = self.spans[other.member];
@@ -375,25 +402,70 @@ impl Touching {
             }
         }
         (0..width).for_each(|i| self.full[i * width + i] += 1.0);
-        if !eliminate(&mut self.full, &mut self.right, &self.spans) {
-            return;
-        }
-        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
-            if point.status == Status::Open {
-                continue;
+    }
+
+    /// Solves the laws by Newton's method with a line search, which comes to an end where the set
+    /// of points that slide does not settle by itself: heavy bodies on light ones. Returns whether
+    /// no site is farther than `enough` (m) from its law.
+    ///
+    /// With `z = sum rows^T (force - pushed)` the force of a point is a function of its own gap
+    /// `off + rows z` alone, because each point has a compliance of its own. The equation
+    /// `z = sum rows^T (force(z) - pushed)` is the gradient of a convex function but for friction.
+    fn descend(&mut self, enough: f64) -> bool {
+        self.z.clone_from(&self.sum);
+        let mut length = self.apply_laws();
+        for _ in 0..Self::DESCENTS {
+            if !length.is_finite() {
+                return false;
             }
-            let mut gap = point.off;
-            for side in sides.iter().flatten() {
-                let span = self.spans[side.member];
-                let z = &self.right[span.start..span.start + span.width];
-                for (gap, row) in gap.iter_mut().zip(self.rows[side.rows..].chunks_exact(span.width)) {
-                    *gap += dot(row, z);
+            if self.amiss() <= enough {
+                return true;
+            }
+            for point in &mut self.points {
+                point.stiffness = cone::stiffness(&point.local, &point.force, point.slid, point.status);
+            }
+            self.fill_matrix();
+            self.right.clone_from(&self.off_balance);
+            if !eliminate(&mut self.full, &mut self.right, &self.spans) {
+                return false;
+            }
+            self.before.clone_from(&self.z);
+            let mut share = 1.0;
+            let next = loop {
+                let ways = self.before.iter().zip(&self.right);
+                self.z.iter_mut().zip(ways).for_each(|(z, (before, way))| *z = before - share * way);
+                let next = self.apply_laws();
+                if next <= (1.0 - 1e-2 * share) * length || share < 1e-2 {
+                    break next;
                 }
+                share *= 0.5;
+            };
+            if next >= length {
+                return false;
             }
-            let force = -(point.stiffness * gap);
-            point.force = if force[0] > 0.0 { force } else { Vector3::zeros() };
+            length = next;
+        }
+        false
+    }
+
+    /// Takes the force of each point from its gap at the coordinates `z`. Returns the length of
+    /// what is then off balance.
+    fn apply_laws(&mut self) -> f64 {
+        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
+            let gap = point.off + along(&self.spans, &self.rows, sides, &self.z);
+            (point.force, point.status) = cone::solve(&point.local, &gap, point.friction, &point.force);
+            point.slid = (gap + point.local * point.force).yz().norm();
         }
         self.sum_changes();
+        self.off_balance.clear();
+        self.off_balance.extend(self.z.iter().zip(&self.sum).map(|(z, sum)| z - sum));
+        dot(&self.off_balance, &self.off_balance).sqrt()
+    }
+
+    /// Largest way of a site by what is off balance, m.
+    fn amiss(&self) -> f64 {
+        let way = |sides| along(&self.spans, &self.rows, sides, &self.off_balance).amax();
+        self.sides.iter().map(way).fold(0.0, f64::max)
     }
 
     /// Computes the responses of all points to forces at all points.
@@ -510,6 +582,19 @@ fn eliminate(m: &mut [f64], x: &mut [f64], spans: &[Span]) -> bool {
         }
     }
     x.iter().all(|x| x.is_finite())
+}
+
+/// Way of a point by the coordinates of all, m, contact axes.
+fn along(spans: &[Span], rows: &[f64], sides: &[Option<Side>; 2], z: &[f64]) -> Vector3<f64> {
+    let mut way = Vector3::zeros();
+    for side in sides.iter().flatten() {
+        let span = spans[side.member];
+        let z = &z[span.start..span.start + span.width];
+        for (way, row) in way.iter_mut().zip(rows[side.rows..].chunks_exact(span.width)) {
+            *way += dot(row, z);
+        }
+    }
+    way
 }
 
 /// Adds the rows of one side times a force to the coordinates of all.

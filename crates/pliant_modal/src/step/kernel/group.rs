@@ -34,6 +34,11 @@ const BAND: f64 = 2e-3;
 const STILL: f64 = 1e-12;
 const ENOUGH: f64 = 1e-6;
 
+/// Violation of the laws beyond which the end of a step does not say where its forces act, as a
+/// share of the size, and the number of rounds without it.
+const FAR: f64 = 1e-3;
+const BEGINNINGS: usize = 1;
+
 /// Way of a body's sites up to which it is not found where they are, as a share of its size.
 const SLACK: f64 = 1e-3;
 
@@ -260,6 +265,8 @@ impl<P: Member> Group<'_, P> {
         points::begin(self, work)?;
         points::begin_probes(self, work)?;
         let known = work.points.len();
+        points::begin_supports(self, work);
+        points::support(self, work, true);
         let mut report = self.attempt(work, &mut theta, true)?;
         if !work.points.is_empty() && gained(work, true) {
             // The forces of the step before, and no others, begin the step anew.
@@ -268,6 +275,7 @@ impl<P: Member> Group<'_, P> {
             let rounds = report.rounds;
             points::begin(self, work)?;
             points::begin_probes(self, work)?;
+            points::support(self, work, true);
             report = self.attempt(work, &mut theta, false)?;
             report.rounds += rounds;
             report.guarded = true;
@@ -352,6 +360,10 @@ impl<P: Member> Group<'_, P> {
         let holds = hands || !self.pushed.is_empty();
         let rounds = ROUNDS[usize::from(holds)];
         let mut report = ContactReport::default();
+        // Forces between heavy bodies turn a light one between them far when they are not in
+        // balance, as those of the step before are not. They act where the step begins until the
+        // result is near.
+        let mut settled = self.pushed.is_empty();
         loop {
             let weight = theta.unwrap_or(0.5);
             self.advance(work, weight);
@@ -364,10 +376,14 @@ impl<P: Member> Group<'_, P> {
             let band = if round == 1 { BAND * self.size } else { 0.0 };
             let (mut new, candidates) = points::detect(self, work, band)?;
             new |= points::detect_probes(self, work)?;
-            points::support(self, work);
+            points::support(self, work, false);
             report.candidates += candidates;
-            points::linearize(self, work, recovers)?;
+            points::linearize(self, work, recovers, settled)?;
             report.residual = work.violation();
+            if !settled && (report.residual <= FAR * self.size || round > BEGINNINGS) {
+                settled = true;
+                points::linearize(self, work, recovers, settled)?;
+            }
             let enough = if round == 1 { STILL } else { ENOUGH } * self.size;
             if work.points.is_empty() || (report.residual <= enough && !new) || round > rounds {
                 points::take_supports(self, work);

@@ -25,7 +25,7 @@ pub(super) use begin::begin;
 pub(super) use detect::detect;
 use pass::march;
 pub(super) use probes::{begin_probes, detect_probes, keep_at_probe};
-pub(super) use rigid::{fill_rows, respond, set_arms, support, take_supports, tell};
+pub(super) use rigid::{begin_supports, fill_rows, respond, set_arms, support, take_supports, tell};
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
 const RECOVERED: f64 = 0.2;
@@ -134,11 +134,13 @@ fn locate_at_body(
     Ok((Located { tangent, toward, center, point, found }, near))
 }
 
-/// Takes the gaps of all points at the end of the computed step.
+/// Takes the gaps of all points at the end of the computed step. Where forces act over the step is
+/// taken from there too, once and for all rounds, if `settles`, and from its beginning otherwise.
 pub(super) fn linearize<P: Member>(
     group: &Group<'_, P>,
     work: &mut Touching,
     recovers: bool,
+    settles: bool,
 ) -> Result<(), StepError> {
     for point in &mut work.points {
         if point.probe.is_some() {
@@ -175,10 +177,15 @@ pub(super) fn linearize<P: Member>(
                     point.carried = far.carried + obstacle.way(&located.point);
                     point.anchor = far.anchor + point.carried;
                     if point.mean.is_none() {
-                        far.middle = 0.5 * (point.start + located.point);
+                        let end = if settles { located.point } else { point.start };
+                        far.middle = 0.5 * (point.start + end);
                     }
                 } else if point.mean.is_none() {
-                    point.arm = located.point - Vector3::from(state.frame.center());
+                    point.arm = if settles {
+                        located.point - Vector3::from(state.frame.center())
+                    } else {
+                        point.start - Vector3::from(kernel.before.frame.center())
+                    };
                 }
                 (located, distance)
             }
@@ -190,11 +197,15 @@ pub(super) fn linearize<P: Member>(
                 else {
                     continue;
                 };
-                let (located, near) = follow((&at, point.site, site), &shapes, far, size);
+                let (located, near) = follow((&at, point.site, site), &shapes, far, size, settles);
                 far.compliance = far_compliance(&other, sites, other.state, far);
                 if point.mean.is_none() {
                     // The middle of the step, as that of both centers of mass.
-                    far.middle = 0.25 * (point.start + located.point + far.start + far.end);
+                    far.middle = if settles {
+                        0.25 * (point.start + located.point + far.start + far.end)
+                    } else {
+                        0.5 * (point.start + far.start)
+                    };
                 }
                 point.carried = far.end - far.start;
                 point.anchor = far.anchor + point.carried;
@@ -213,7 +224,9 @@ pub(super) fn linearize<P: Member>(
         // The middle of the step gives the work of a force on a shape that bends. With the mean and
         // the arm of every round the rounds of a soft or heavily loaded body would not converge.
         let start = point.tangent;
-        point.mean.get_or_insert_with(|| 0.5 * (start + located.tangent));
+        if settles {
+            point.mean.get_or_insert_with(|| 0.5 * (start + located.tangent));
+        }
     }
     Ok(())
 }
@@ -224,6 +237,7 @@ fn follow(
     [start, end]: &[Shape<'_>; 2],
     far: &mut Far,
     size: f64,
+    settles: bool,
 ) -> (Located, Near) {
     let look = || locate_at_body((own, index, site), end, DEEP * size, Some(&far.place), Guess::None);
     let (located, near) = (!far.passed).then(look).and_then(Result::ok).unwrap_or_else(|| {
@@ -253,7 +267,7 @@ fn follow(
     let ((begun, _), (ended, _)) =
         (start.material(&near.place, &carriers), end.material(&near.place, &carriers));
     (far.start, far.end) = (begun, ended);
-    if far.mean.is_none() {
+    if far.mean.is_none() && settles {
         let [(_, from), (_, to)] = [start, end].map(|shape| shape.material(&near.place, &far.carriers));
         let mean: Tangent = 0.5 * (from + to);
         far.mean = Some(mean);

@@ -40,14 +40,18 @@ pub(super) fn side<P: Member>(
 }
 
 /// Adds the places where the rigid bodies touch others of their engine, once a body touches one.
-pub(in super::super) fn support<P: Member>(group: &Group<'_, P>, work: &mut Touching) {
+/// They begin with the forces of `work.supports`, by rigid bodies and places, if these are there.
+pub(in super::super) fn support<P: Member>(group: &Group<'_, P>, work: &mut Touching, with_forces: bool) {
     let touched = work.points.iter().any(|point| point.rigid.is_some());
     if !touched || work.points.iter().any(|point| point.support.is_some()) {
         return;
     }
     let first = group.len() + group.held.len();
+    let mut begun = 0;
     for (number, &index) in group.pushed.iter().enumerate() {
         let rigid = &group.rigids[index];
+        let forces = begun..begun + rigid.supports.len();
+        begun = forces.end;
         for (at, support) in rigid.supports.iter().enumerate().filter(|(_, support)| support.is_sound()) {
             let mut point = ContactPoint::new(first + number, at, Touched::Obstacle(index), support.friction);
             point.support = Some(AtSupport { rigid: index, support: at, arm: Vector3::zeros() });
@@ -66,7 +70,24 @@ pub(in super::super) fn support<P: Member>(group: &Group<'_, P>, work: &mut Touc
             (point.start, point.place, point.gap) = (place, place, support.gap);
             point.compliance = Matrix3::identity() * (SOFT * group.h * group.h * light);
             point.turn(&Vector3::from(support.normal));
+            if let Some(force) = work.supports.get(forces.start + at).filter(|_| with_forces) {
+                point.pushed[0] = *force;
+                point.force = point.pushed;
+            }
             work.points.push(point);
+        }
+    }
+}
+
+/// Takes the forces with which the engine of the rigid bodies holds them at the beginning of the
+/// step, so that one that is lighter than what it carries does not fly away from the forces of the
+/// step before.
+pub(in super::super) fn begin_supports<P: Member>(group: &mut Group<'_, P>, work: &mut Touching) {
+    work.supports.clear();
+    for &index in group.pushed {
+        for support in &mut group.rigids[index].supports {
+            let force = std::mem::take(&mut support.force);
+            work.supports.push(if force > 0.0 && force.is_finite() { force } else { 0.0 });
         }
     }
 }
