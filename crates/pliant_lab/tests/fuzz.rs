@@ -36,8 +36,8 @@ fn no_bytes_panic_a_parser_or_a_session() {
 #[ignore = "writes into the repository"]
 fn corpora_are_written() {
     use pliant_haptics::{Record, Recorder, Sample, VirtualConfig, Wrench};
-    use pliant_modal::{ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig};
-    use pliant_stream::wire::{PROTOCOL_VERSION, PeerBodyState, PeerMessage};
+    use pliant_modal::{ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig, HeldPlace};
+    use pliant_stream::wire::{PROTOCOL_VERSION, PeerBodyState, PeerMessage, PeerShapes};
     use pliant_stream::{
         Channel, DisconnectReason, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig, PeerId,
         StepSettings, Surroundings, TickState,
@@ -118,6 +118,7 @@ fn corpora_are_written() {
             write("datagrams", &format!("peer-{}", kind(bytes)), bytes);
         });
     }
+    let place = HeldPlace { vertex: 3, radius: 0.0625, way: [0.02, 0.0, -0.04] };
     let state = PeerBodyState {
         body: 1,
         q: vec![0.5; 2],
@@ -137,6 +138,8 @@ fn corpora_are_written() {
             }],
             ..ContactState::default()
         },
+        s: vec![0.5; 2],
+        shapes: vec![PeerShapes { from: 5, places: vec![place] }],
     };
     for (name, message) in [
         (
@@ -153,6 +156,7 @@ fn corpora_are_written() {
         ("welcome", PeerMessage::Welcome { user: 2, others: vec![(3, "elsewhere".into())] }),
         ("request", PeerMessage::StateRequest),
         ("state", PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![state] }),
+        ("shapes", PeerMessage::Shapes { body: 1, from: 12, places: vec![place] }),
         ("goodbye", PeerMessage::Goodbye { reason: DisconnectReason::Left }),
     ] {
         write("peers", name, &message.encode());

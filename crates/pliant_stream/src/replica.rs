@@ -297,6 +297,22 @@ impl Replica {
         self.kernel.set_held_shapes(shapes, &mut state, &[]).ok();
     }
 
+    /// Gives a copy the own shapes of held patches with which it is stepped next, with the hands
+    /// that were added since [`Replica::release_all`]. What the hands feel goes on as it was.
+    pub(crate) fn shape(&mut self, copy: &mut BodyCopy, to: Option<&Arc<HeldShapes>>) {
+        let same = |a: Option<&Arc<HeldShapes>>, b: Option<&Arc<HeldShapes>>| {
+            a.map(Arc::as_ptr) == b.map(Arc::as_ptr)
+        };
+        // The kernel may have stepped a copy of another tick last.
+        if !same(self.kernel.held_shapes(), copy.shapes.as_ref()) {
+            self.set_held_shapes(copy.shapes.clone());
+        }
+        if !same(copy.shapes.as_ref(), to) {
+            self.kernel.set_held_shapes(to.cloned(), &mut copy.state, &self.hands).ok();
+            copy.shapes = self.kernel.held_shapes().cloned();
+        }
+    }
+
     /// Brings the columns of held patches in a state to rest under the reactions (N, world axes) of
     /// hands on patches, given by vertex and radius (m).
     pub(crate) fn equilibrate_columns(

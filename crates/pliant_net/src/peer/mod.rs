@@ -286,6 +286,7 @@ impl NetPeer {
             for (&id, played) in &self.bodies {
                 session.add_body(id, played.model.clone(), &played.settings)?;
                 session.set_surroundings(id, played.around.clone())?;
+                session.set_held_shapes(id, played.held_shapes)?;
             }
             Ok(session)
         });
@@ -319,7 +320,7 @@ impl NetPeer {
             world.get_resource::<Time<Fixed>>().map_or(Duration::from_millis(25), Time::<Fixed>::timestep);
         let mut found = BTreeMap::new();
         let mut shared = world.query::<(Entity, &SharedBody, &ModalBody, Option<&BodyState>)>();
-        for (entity, name, _, state) in shared.iter(world) {
+        for (entity, name, wanted, state) in shared.iter(world) {
             let Some(state) = state.filter(|state| state.has_place()) else { return false };
             let settings = play::agreed_settings(state.body());
             let id = number_of(&name.name);
@@ -327,7 +328,9 @@ impl NetPeer {
                 warn_once!("{} is left out: another body has its number", name.name);
                 continue;
             }
-            found.insert(id, PlayedBody::new(entity, state.model().clone(), settings));
+            let mut played = PlayedBody::new(entity, state.model().clone(), settings);
+            played.held_shapes = wanted.held_shapes;
+            found.insert(id, played);
         }
         if found.is_empty() {
             return false;

@@ -1,10 +1,11 @@
 //! The local hands, and the displayed state and the forces.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
-use pliant_body::{BodyState, FixedObstacles, Grab, GrabForce, GrabOf, Impulse};
+use pliant_body::{BodyState, FixedObstacles, Grab, GrabForce, GrabOf, HeldShapesCache, Impulse};
 use pliant_modal::{Body, FixedObstacle, FixedShape, ModalModel, ObstacleShape};
 use pliant_stream::peer::PeerSession;
 use pliant_stream::{BodyId, GrabKey, StepSettings, StreamError, Surroundings};
@@ -20,13 +21,15 @@ pub(super) struct PlayedBody {
     pub(super) model: Arc<ModalModel>,
     pub(super) settings: StepSettings,
     pub(super) around: Surroundings,
+    /// Whether it gets the own shapes of held patches.
+    pub(super) held_shapes: bool,
     display: BodyDisplay,
 }
 
 impl PlayedBody {
     pub(super) fn new(entity: Entity, model: Arc<ModalModel>, settings: StepSettings) -> Self {
         let (around, display) = (Surroundings::default(), BodyDisplay::default());
-        Self { entity, model, settings, around, display }
+        Self { entity, model, settings, around, held_shapes: true, display }
     }
 }
 
@@ -145,6 +148,7 @@ pub(crate) fn show(
     net: Option<ResMut<NetPeer>>,
     mut bodies: DisplayedBodies,
     mut forces: Query<&mut GrabForce>,
+    cache: Option<ResMut<HeldShapesCache>>,
 ) {
     let Some(mut net) = net else { return };
     let net = &mut *net;
@@ -152,13 +156,16 @@ pub(crate) fn show(
     let now = net.now();
     let Some(session) = &mut net.session else { return };
     session.update(now);
+    if let Some(mut cache) = cache {
+        make_shapes(session, &net.bodies, &mut cache);
+    }
     let step = net.step.as_secs_f64();
     for (&id, played) in &mut net.bodies {
         let Some(view) = session.body(id) else { continue };
         let Ok((state, mut visual, mut hands, mut transform, global)) = bodies.get_mut(played.entity) else {
             continue;
         };
-        played.display.take(view.tick(), &view.visual().q, view.pose(), None);
+        played.display.take(view.tick(), &view.visual().q, view.pose(), view.held_shapes());
         played.display.write((step, now, false), state, &mut visual, &mut transform, &mut net.scratch);
         let Some(place) = SessionTransform::of_body(global, state) else { continue };
         hands.set_if_neq(remote_hands(view.grabs(), Some(user), &place));
@@ -173,6 +180,20 @@ pub(crate) fn show(
         }
     }
     net.flush();
+}
+
+/// Gives the session the own shapes of held patches that it asks for, as soon as they are made.
+fn make_shapes(
+    session: &mut PeerSession,
+    bodies: &BTreeMap<BodyId, PlayedBody>,
+    cache: &mut HeldShapesCache,
+) {
+    for (id, places) in session.shapes_to_make() {
+        let Some(played) = bodies.get(&id) else { continue };
+        if let Some(shapes) = cache.get(&played.model, &places) {
+            session.take_shapes(id, &places, shapes);
+        }
+    }
 }
 
 #[cfg(test)]

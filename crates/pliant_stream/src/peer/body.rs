@@ -1,10 +1,12 @@
 //! One body at a peer: stepped at once, and stepped again when a late input arrives.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use pliant_modal::{Frame, Load, ModalModel, StepSettings};
+use pliant_modal::{Frame, HeldPlace, HeldShapes, Load, ModalModel, StepSettings};
 
+use super::columns::{Columns, Taken};
 use super::inputs::{BodyInputs, InputLog, WINDOW};
 use crate::codec::checksum::{checksum, projection};
 use crate::newmark::{Newmark, ViscoelasticFilter};
@@ -47,6 +49,11 @@ pub struct PeerBody {
     visual: VisualCopy,
     grabs: Vec<GrabState>,
     restepped: u64,
+    pub(crate) columns: Columns,
+    /// Whether the body is stepped with own shapes of held patches, where it can be.
+    pub(crate) wants_shapes: bool,
+    /// A state that was taken without the shapes that it had, because they are not made yet.
+    unshaped: Option<(Tick, Box<PeerBodyState>)>,
 }
 
 impl PeerBody {
@@ -79,6 +86,9 @@ impl PeerBody {
             used: Ring::new(WINDOW),
             grabs: Vec::new(),
             restepped: 0,
+            columns: Columns::default(),
+            wants_shapes: true,
+            unshaped: None,
         })
     }
 
@@ -143,7 +153,7 @@ impl PeerBody {
 
     /// Returns the checksum of a remembered tick and the magnitude that scales its tolerance.
     pub(crate) fn check(&self, tick: Tick) -> Option<(f64, f64)> {
-        let state = self.past(tick)?;
+        let BodyCopy { state, shapes, .. } = self.rollback.at(tick)?;
         let mut size = state.q.iter().chain(&state.z).map(|q| q * q).sum::<f64>();
         let mut sum = checksum(tick, state);
         if let Some(pose) = self.past_pose(tick) {
@@ -155,7 +165,68 @@ impl PeerBody {
             size += all.iter().map(|x| x * x).sum::<f64>();
             sum += projection(tick ^ 1, &all);
         }
-        Some((sum, size.sqrt()))
+        let size = size.sqrt();
+        // Peers with other shapes disagree, however little these have changed yet.
+        let named = shapes.as_ref().map_or(0.0, |shapes| name(shapes));
+        Some((sum + size * named, size))
+    }
+
+    /// Whether the own shapes of held patches at a remembered tick are still to be made.
+    pub(crate) fn lacks_shapes(&self, tick: Tick) -> bool {
+        self.used.get(tick).is_some_and(|inputs| self.columns.lacks(tick, inputs))
+    }
+
+    /// The own shapes of held patches in the live state, and their coordinates.
+    pub fn held_shapes(&self) -> Option<(&Arc<HeldShapes>, &[f64])> {
+        let BodyCopy { state, shapes, .. } = &self.rollback.now;
+        Some((shapes.as_ref()?, &state.s))
+    }
+
+    /// Whether shapes of held patches count for the body.
+    pub(crate) fn takes_shapes(&self) -> bool {
+        let reduced = self.model.parts().reduced.as_ref();
+        let has_mesh = reduced.is_some_and(|reduced| reduced.mesh.is_some());
+        self.wants_shapes && has_mesh && self.settings().is_reduced(&self.model)
+    }
+
+    /// The patches that hands hold, and where they are in the live state. Each user's first hand
+    /// comes before anybody's second, so that nobody's many hands displace another one.
+    pub(crate) fn held_places(&mut self) -> Vec<HeldPlace> {
+        let mut of_user: BTreeMap<UserId, usize> = BTreeMap::new();
+        let mut order: Vec<(usize, u32, f64)> = Vec::new();
+        for (user, held) in self.inputs.held.iter().filter(|(_, held)| held.radius <= self.model.size()) {
+            let count = of_user.entry(*user).or_default();
+            order.push((*count, held.vertex, held.radius));
+            *count += 1;
+        }
+        order.sort_by_key(|(count, ..)| *count);
+        order.truncate(HeldShapes::MAX_PATCHES);
+        let state = &self.rollback.now.state;
+        let place = |(_, vertex, radius)| self.replica.held_place(state, vertex, radius);
+        order.into_iter().filter_map(place).collect()
+    }
+
+    /// Takes shapes of held patches that were made, and steps again what lacked them. Returns for
+    /// what they were taken, and false when the tick from which they count is not remembered.
+    pub(crate) fn take_shapes(
+        &mut self,
+        places: &[HeldPlace],
+        shapes: &Option<Arc<HeldShapes>>,
+        taken: Tick,
+        inputs: &InputLog,
+    ) -> (Taken, bool) {
+        let found = self.columns.take(places, shapes);
+        let Some(from) = found.from.filter(|from| *from <= self.tick()) else { return (found, true) };
+        let remembered = self.tick().saturating_sub(WINDOW as u64 - 1);
+        let is_made = |(tick, _): &mut (Tick, _)| self.columns.at(*tick).flatten().is_some();
+        if let Some((tick, state)) = self.unshaped.take_if(is_made) {
+            // The state that was taken had these shapes.
+            let is_whole = tick >= remembered && self.import(tick, self.tick(), &state, inputs);
+            return (found, is_whole);
+        }
+        // What is before the last state that was taken stays as the state had it.
+        let from = from.max(taken + 1);
+        (found, from > self.tick() || self.correct(from, inputs))
     }
 
     /// All grabs of the body, with their reactions.
@@ -190,8 +261,10 @@ impl PeerBody {
     }
 
     pub(crate) fn export(&self, tick: Tick) -> Option<PeerBodyState> {
-        let BodyCopy { state, hands, contacts } = self.rollback.at(tick)?;
+        let BodyCopy { state, hands, contacts, .. } = self.rollback.at(tick)?;
         Some(PeerBodyState {
+            s: state.s.clone(),
+            shapes: self.columns.told(tick),
             body: self.id.0,
             q: state.q.clone(),
             v: state.v.clone(),
@@ -231,10 +304,19 @@ impl PeerBody {
         }
         let (q, v, a, z) = (state.q.clone(), state.v.clone(), state.a.clone(), state.z.clone());
         let f = state.force.clone();
-        let received = State { q, v, a, f, z, s: Vec::new(), frame: received.unwrap_or(self.live().frame) };
+        let mut received =
+            State { q, v, a, f, z, s: Vec::new(), frame: received.unwrap_or(self.live().frame) };
         if self.replica.kernel().check(&received).is_err() {
             return false;
         }
+        self.columns.replace(&self.model, if self.takes_shapes() { &state.shapes } else { &[] });
+        // Without the shapes that the state had, the body goes on nearly alike until they are made.
+        let had = self.columns.at(tick).filter(|_| !state.s.is_empty());
+        let shapes = had.flatten().filter(|shapes| shapes.columns() == state.s.len()).cloned();
+        if shapes.is_some() {
+            received.s.clone_from(&state.s);
+        }
+        self.unshaped = had.is_some_and(|made| made.is_none()).then(|| (tick, Box::new(state.clone())));
         let hand = |p: &PeerHandState| HandState {
             key: GrabKey { user: UserId(p.user), grab: p.grab },
             pull: p.pull.into(),
@@ -244,7 +326,8 @@ impl PeerBody {
         };
         let hands = state.pulls.iter().map(hand).collect();
         let contacts = state.contacts.clone();
-        let before = std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands, contacts });
+        let before =
+            std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands, contacts, shapes });
         let fresh = self.tick() == 0;
         self.reach(tick);
         while self.tick() < to {
@@ -278,7 +361,9 @@ impl PeerBody {
             return false;
         }
         let before = self.live().clone();
-        if self.repair == LateInputRepair::Compensate && !self.lacks_impulse(from, inputs) {
+        // Equations (8) and (9) know nothing of shapes of held patches.
+        let compensates = self.repair == LateInputRepair::Compensate && self.columns.is_empty();
+        if compensates && !self.lacks_impulse(from, inputs) {
             self.compensate(from, inputs);
         } else {
             self.rollback.back_to(base);
@@ -310,8 +395,8 @@ impl PeerBody {
             let Some(used) = self.used.get_mut(tick).filter(|used| known && done != **used) else { continue };
             let Some(before) = self.rollback.at(tick - 1) else { continue };
             let (mut with, mut without) = (before.clone(), before.clone());
-            Self::press(&mut self.replica, &mut with, &done);
-            Self::press(&mut self.replica, &mut without, used);
+            Self::press(&mut self.replica, &mut with, &done, None);
+            Self::press(&mut self.replica, &mut without, used, None);
             used.clone_from(&done);
             let (with_frame, without_frame) = (with.state.frame, without.state.frame);
             // The history is corrected like the present state, because later corrections and checks
@@ -348,12 +433,19 @@ impl PeerBody {
     fn step_once(&mut self, inputs: &InputLog) {
         let tick = self.tick() + 1;
         inputs.of_body(tick, self.id, &self.forecast, &mut self.inputs);
-        Self::press(&mut self.replica, &mut self.rollback.now, &self.inputs);
+        let shapes = self.columns.of_step(tick, &self.inputs);
+        Self::press(&mut self.replica, &mut self.rollback.now, &self.inputs, shapes);
         self.reach(tick);
     }
 
-    /// Steps a copy once with the impulses and the hands of the inputs.
-    fn press(replica: &mut Replica, copy: &mut BodyCopy, inputs: &BodyInputs) {
+    /// Steps a copy once with the impulses and the hands of the inputs, and with the own shapes of
+    /// held patches.
+    fn press(
+        replica: &mut Replica,
+        copy: &mut BodyCopy,
+        inputs: &BodyInputs,
+        shapes: Option<&Arc<HeldShapes>>,
+    ) {
         for (_, i) in &inputs.impulses {
             replica.apply_impulse(copy, i.vertex, i.impulse);
         }
@@ -365,6 +457,7 @@ impl PeerBody {
                 replica.hold_at(copy, g.key(*user), (g.vertex, g.radius), g.target.into(), g.hold);
             }
         }
+        replica.shape(copy, shapes);
         replica.step_held(copy, &Load::default());
     }
 
@@ -391,6 +484,19 @@ impl PeerBody {
             });
         }
     }
+}
+
+/// A number from -1 to 1 that stands for the places that shapes were made of.
+fn name(shapes: &HeldShapes) -> f64 {
+    let bits = |place: HeldPlace| {
+        let numbers = [place.radius, place.way[0], place.way[1], place.way[2]];
+        [u64::from(place.vertex)].into_iter().chain(numbers.map(f64::to_bits))
+    };
+    // FNV-1a over whole words. Its upper bits depend on all of them.
+    let hash = shapes.places().flat_map(bits).fold(0xCBF2_9CE4_8422_2325_u64, |hash, word| {
+        (hash ^ word).wrapping_mul(0x0000_0100_0000_01B3).rotate_left(29)
+    });
+    (hash >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
 }
 
 /// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds`

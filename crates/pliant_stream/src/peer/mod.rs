@@ -12,6 +12,7 @@
 //! state.
 
 mod body;
+mod columns;
 mod config;
 mod inputs;
 mod other;

@@ -42,6 +42,8 @@ pub(super) struct PeerBudgets {
     /// What the peer's late inputs cost: for each tick that is stepped again, one and one for each
     /// hand.
     pub(super) late: Budget,
+    /// What the peer says of shapes of held patches.
+    pub(super) shapes: Budget,
 }
 
 impl PeerBudgets {
@@ -55,6 +57,8 @@ impl PeerBudgets {
             // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
             // each tick, one with one hand may be 96 ticks late, and one with ten 17.
             late: Budget::new(192.0 / step, 256.0),
+            // Each set is told twice, and a peer has no more than one a second made.
+            shapes: Budget::new(3.0, 24.0),
         }
     }
 }

@@ -5,6 +5,7 @@ mod introductions;
 mod joining;
 mod pace;
 mod repair;
+mod shapes;
 mod states;
 
 use std::collections::{BTreeMap, VecDeque};
@@ -21,7 +22,7 @@ use super::body::PeerBody;
 use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
 use super::other::{Hello, PeerBudgets, RemotePeer, SharedBudgets};
-use crate::link::{AwayBudgets, Events};
+use crate::link::{AwayBudgets, Budget, Events};
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{
@@ -83,6 +84,8 @@ pub struct PeerSession {
     events: Events<PeerEvent>,
     requested: Option<Duration>,
     last_check: Option<StateCheck>,
+    /// What making shapes of held patches may cost.
+    making: Budget,
     /// Counts of the connections that have ended.
     gone: LinkStats,
 }
@@ -140,6 +143,7 @@ impl PeerSession {
             events: Events::default(),
             requested: None,
             last_check: None,
+            making: shapes::making(),
             gone: LinkStats::default(),
         })
     }
@@ -183,7 +187,19 @@ impl PeerSession {
         self.bodies.get_mut(&id).ok_or(StreamError::UnknownBody(id))?.set_surroundings(around)
     }
 
-    /// Digest of the bodies, their models, step settings and surroundings, and the step length.
+    /// Sets whether a body is stepped with the own shapes of its held patches
+    /// ([`PeerSession::shapes_to_make`]). All peers set the same before they connect. Default:
+    /// true. Only bodies with reduced elasticity have such shapes.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::UnknownBody`] for an unknown body.
+    pub fn set_held_shapes(&mut self, id: BodyId, wants: bool) -> Result<(), StreamError> {
+        self.bodies.get_mut(&id).ok_or(StreamError::UnknownBody(id))?.wants_shapes = wants;
+        Ok(())
+    }
+
+    /// Digest of the bodies, their models, step settings and surroundings, whether they are stepped
+    /// with own shapes of held patches, and the step length.
     pub fn scene(&self) -> u64 {
         let mut hasher = blake3::Hasher::new();
         hasher.update(&self.config.step.to_bits().to_le_bytes());
@@ -192,6 +208,7 @@ impl PeerSession {
             hasher.update(&body.model().hash().0);
             hasher.update(&body.settings().to_bytes());
             hasher.update(&body.surroundings().to_bytes());
+            hasher.update(&[u8::from(body.takes_shapes())]);
         }
         let mut first = [0; 8];
         first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
@@ -344,6 +361,9 @@ impl PeerSession {
             }
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
             Ok(PeerMessage::Others { others }) => self.take_others(now, peer, others),
+            Ok(PeerMessage::Shapes { body, from, places }) => {
+                self.take_places(now, peer, BodyId(body), from, places);
+            }
             Err(_) => {
                 other.link.reject();
                 self.turn_away(peer, DisconnectReason::Protocol);
@@ -427,6 +447,8 @@ impl PeerSession {
             body.advance(&self.inputs);
         }
         self.inputs.forget_gone(self.tick);
+        let tick = self.tick;
+        self.bodies.values_mut().for_each(|body| body.columns.forget(tick));
         let confirmed = self.confirmed();
         let due = confirmed - confirmed % CHECK_EVERY;
         let mut check = None;
@@ -434,7 +456,7 @@ impl PeerSession {
             // Each check covers one body, in turn.
             let index = (due / CHECK_EVERY) as usize % self.bodies.len().max(1);
             check =
-                self.bodies.values().nth(index).and_then(|b| {
+                self.bodies.values().nth(index).filter(|b| !b.lacks_shapes(due)).and_then(|b| {
                     Some(StateCheck { body: b.id(), tick: due, value: b.check(due)?.0 as f32 })
                 });
             self.last_check = check.or(self.last_check);

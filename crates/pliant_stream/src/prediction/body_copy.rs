@@ -1,8 +1,10 @@
 //! The state of a body with its hands and contacts, as one step leaves it and the next one needs
 //! it.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
-use pliant_modal::{ContactState, State};
+use pliant_modal::{ContactState, HeldShapes, State};
 
 use crate::state::GrabKey;
 
@@ -36,11 +38,19 @@ pub(crate) struct BodyCopy {
     pub state: State,
     pub hands: Vec<HandState>,
     pub contacts: ContactState,
+    /// The own shapes of held patches whose coordinates the state has, where the copies of a body
+    /// change them by tick ([`Replica::shape`](crate::replica::Replica::shape)).
+    pub shapes: Option<Arc<HeldShapes>>,
 }
 
 impl Clone for BodyCopy {
     fn clone(&self) -> Self {
-        Self { state: self.state.clone(), hands: self.hands.clone(), contacts: self.contacts.clone() }
+        Self {
+            state: self.state.clone(),
+            hands: self.hands.clone(),
+            contacts: self.contacts.clone(),
+            shapes: self.shapes.clone(),
+        }
     }
 
     /// Copies into the memory that is there, because every tick is remembered.
@@ -48,13 +58,14 @@ impl Clone for BodyCopy {
         self.state.clone_from(&from.state);
         self.hands.clone_from(&from.hands);
         self.contacts.clone_from(&from.contacts);
+        self.shapes.clone_from(&from.shapes);
     }
 }
 
 impl BodyCopy {
     /// A copy without hands and contacts.
     pub(crate) fn new(state: State) -> Self {
-        Self { state, hands: Vec::new(), contacts: ContactState::default() }
+        Self { state, hands: Vec::new(), contacts: ContactState::default(), shapes: None }
     }
 
     pub(crate) fn hand(&self, key: GrabKey) -> Option<&HandState> {

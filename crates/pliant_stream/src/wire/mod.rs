@@ -24,9 +24,9 @@ pub use inputs::{HeldAt, ImpulseAt, InputTick, Inputs, StateCheck};
 pub(crate) use inputs::{MAX_HELD, MAX_IMPULSES, MAX_TICKS};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
 pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, check_hold};
-pub(crate) use peer_message::{MAX_ADDRESS, MAX_PEERS};
-pub use peer_message::{PeerBodyState, PeerFrame, PeerHandState, PeerMessage};
+pub(crate) use peer_message::{MAX_ADDRESS, MAX_PEERS, MAX_SETS};
+pub use peer_message::{PeerBodyState, PeerFrame, PeerHandState, PeerMessage, PeerShapes};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.
-pub const PROTOCOL_VERSION: u16 = 7;
+pub const PROTOCOL_VERSION: u16 = 8;

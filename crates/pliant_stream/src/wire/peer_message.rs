@@ -1,6 +1,6 @@
 //! Reliable messages between peers.
 
-use pliant_modal::ContactState;
+use pliant_modal::{ContactState, HeldPlace, HeldShapes};
 use serde::{Deserialize, Serialize};
 
 use super::message::{check, decode, encode, wide_range};
@@ -16,6 +16,9 @@ pub(crate) const MAX_ADDRESS: usize = 512;
 
 /// Largest number of hands on a body: sixteen of each peer, as many as an input has.
 const MAX_HANDS: usize = (MAX_PEERS + 1) * 16;
+
+/// Largest number of sets of shapes of held patches that are remembered of a body.
+pub(crate) const MAX_SETS: usize = 16;
 
 /// The rigid frame of a free body in a [`PeerBodyState`], world axes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -51,6 +54,33 @@ pub struct PeerBodyState {
     pub pulls: Vec<PeerHandState>,
     /// What the contacts of the last step have left for the next.
     pub contacts: ContactState,
+    /// Coordinates of the own shapes of held patches; empty where the last step had none.
+    pub s: Vec<f64>,
+    /// The shapes that count at the tick of the state, and those that count later, at most 16.
+    pub shapes: Vec<PeerShapes>,
+}
+
+/// The own shapes of held patches that count from a tick on ([`pliant_modal::HeldShapes`]).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PeerShapes {
+    /// The first tick that is stepped with them.
+    pub from: u64,
+    /// What they are made of, exactly: one to four patches, ascending by vertex and radius.
+    pub places: Vec<HeldPlace>,
+}
+
+impl PeerShapes {
+    fn check(&self) -> Result<(), StreamError> {
+        check("tick of shapes", self.from < TICK_LIMIT, self.from, "below 2^48")?;
+        check_places(&self.places)
+    }
+}
+
+fn check_places(places: &[HeldPlace]) -> Result<(), StreamError> {
+    let few = (1..=HeldShapes::MAX_PATCHES).contains(&places.len());
+    check("held patches", few, places.len(), "1 to 4")?;
+    let sane = places.iter().all(|p| p.radius >= 0.0 && in_range(&[p.radius]) && in_range(&p.way));
+    check("held patches", sane, "a number out of range", "finite numbers")
 }
 
 impl PeerBodyState {
@@ -58,7 +88,12 @@ impl PeerBodyState {
     pub(crate) fn most_bytes(&self) -> usize {
         let numbers = [&self.q, &self.v, &self.a, &self.z, &self.force].map(Vec::len);
         // Twelve numbers of a hand and nine of a contact, with what names them.
-        256 + 8 * numbers.iter().sum::<usize>() + 104 * self.pulls.len() + 80 * self.contacts.memory.len()
+        // Ten bytes of a tick and at most 37 of each patch.
+        let shapes: usize = self.shapes.iter().map(|of| 16 + 40 * of.places.len()).sum();
+        256 + 8 * (numbers.iter().sum::<usize>() + self.s.len())
+            + 104 * self.pulls.len()
+            + 80 * self.contacts.memory.len()
+            + shapes
     }
 
     fn check(&self) -> Result<(), StreamError> {
@@ -66,6 +101,12 @@ impl PeerBodyState {
         let equal = [&self.v, &self.a, &self.force].iter().all(|x| x.len() == modes) && modes <= MAX_MODES;
         let equal = equal && (self.z.is_empty() || self.z.len() == modes);
         check("state lengths", equal, modes, "the same for q, v, a, z and forces, at most 4096")?;
+        check("coordinates of shapes", self.s.len() <= MAX_MODES, self.s.len(), "at most 4096")?;
+        let sets = &self.shapes;
+        check("shapes", sets.len() <= MAX_SETS, sets.len(), "at most 16")?;
+        let ascend = sets.windows(2).all(|pair| pair[0].from < pair[1].from);
+        check("shapes", ascend, "ticks that do not ascend", "ascending ticks")?;
+        sets.iter().try_for_each(PeerShapes::check)?;
         let hands = self.pulls.len();
         check("state hands", hands <= MAX_HANDS, hands, "at most 1040")?;
         let frame = self.frame.is_none_or(|f| {
@@ -75,7 +116,7 @@ impl PeerBodyState {
         let hand = |p: &PeerHandState| [p.pull, p.mean, p.target, p.viscoelastic].iter().all(|x| in_range(x));
         let sane = frame
             && [&self.q, &self.v, &self.z].iter().all(|x| in_range(x))
-            && [&self.a, &self.force].iter().all(|x| wide_range(x))
+            && [&self.a, &self.force, &self.s].iter().all(|x| wide_range(x))
             && self.pulls.iter().all(hand)
             && self.contacts.is_valid();
         check("state", sane, "a number out of range", "finite numbers")
@@ -148,6 +189,15 @@ pub enum PeerMessage {
         /// The peers, as numbers and addresses, at most 64.
         others: Vec<(u16, String)>,
     },
+    /// The own shapes of held patches with which a body is stepped.
+    Shapes {
+        /// Number of the body.
+        body: u16,
+        /// The first tick that is stepped with them. 0: they are to be made, and the tick follows.
+        from: u64,
+        /// What they are made of, exactly: one to four patches, ascending by vertex and radius.
+        places: Vec<HeldPlace>,
+    },
 }
 
 fn check_others(others: &[(u16, String)]) -> Result<(), StreamError> {
@@ -185,6 +235,10 @@ impl PeerMessage {
                 check("state tick", *tick.max(now) < TICK_LIMIT, tick.max(now), "below 2^48")?;
                 check("state bodies", bodies.len() <= MAX_BODIES, bodies.len(), "at most 1024")?;
                 bodies.iter().try_for_each(PeerBodyState::check)?;
+            }
+            Self::Shapes { from, places, .. } => {
+                check("tick of shapes", *from < TICK_LIMIT, from, "below 2^48")?;
+                check_places(places)?;
             }
             Self::StateRequest | Self::Goodbye { .. } => {}
         }

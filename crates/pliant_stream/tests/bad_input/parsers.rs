@@ -3,16 +3,18 @@
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use pliant_modal::{ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig, ModalModel};
+use pliant_modal::{
+    ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig, HeldPlace, ModalModel,
+};
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::wire::{
     BodyInfo, Datagram, GuestMessage, HeldAt, HostMessage, ImpulseAt, InputTick, Inputs, PeerBodyState,
-    PeerMessage, TargetEntry, Targets,
+    PeerMessage, PeerShapes, TargetEntry, Targets,
 };
 use pliant_stream::{StepSettings, StreamError, Surroundings};
 use proptest::prelude::*;
 
-use super::samples::{around, contacts, real_inputs, samples};
+use super::samples::{around, contacts, places, real_inputs, samples};
 use super::support::direct::{BODY, random};
 
 proptest! {
@@ -130,7 +132,8 @@ fn obstacles_and_contacts_that_are_none_are_refused() {
     let state = |contacts: ContactState| {
         let zero = || vec![0.0; 4];
         let (q, v, a, z, force) = (zero(), zero(), zero(), Vec::new(), zero());
-        let body = PeerBodyState { body: 1, q, v, a, z, force, frame: None, pulls: Vec::new(), contacts };
+        let (pulls, s, shapes) = (Vec::new(), Vec::new(), Vec::new());
+        let body = PeerBodyState { body: 1, q, v, a, z, force, frame: None, pulls, contacts, s, shapes };
         PeerMessage::decode(&PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![body] }.encode())
     };
     state(contacts()).unwrap();
@@ -146,6 +149,39 @@ fn obstacles_and_contacts_that_are_none_are_refused() {
     ] {
         assert!(state(bad.clone()).is_err(), "{bad:?}");
     }
+}
+
+#[test]
+fn shapes_of_held_patches_that_are_none_are_refused() {
+    let told = |from, places: Vec<HeldPlace>| {
+        PeerMessage::decode(&PeerMessage::Shapes { body: 1, from, places }.encode())
+    };
+    told(0, places(1)).unwrap();
+    told(1 << 40, places(4)).unwrap();
+    let one = places(1)[0];
+    let [x, y, z] = [f64::NAN, f64::INFINITY, 1e300].map(|bad| HeldPlace { way: [0.0, bad, 0.0], ..one });
+    let [r, s] = [f64::NAN, -1.0].map(|radius| HeldPlace { radius, ..one });
+    for bad in [x, y, z, r, s] {
+        assert!(told(5, vec![bad]).is_err(), "{bad:?}");
+    }
+    assert!(told(5, Vec::new()).is_err() && told(5, places(5)).is_err());
+    assert!(told(1 << 48, places(1)).is_err());
+
+    let state = |shapes: Vec<PeerShapes>, s: Vec<f64>| {
+        let zero = || vec![0.0; 4];
+        let (q, v, a, z, force) = (zero(), zero(), zero(), Vec::new(), zero());
+        let (pulls, contacts) = (Vec::new(), ContactState::default());
+        let body = PeerBodyState { body: 1, q, v, a, z, force, frame: None, pulls, contacts, s, shapes };
+        PeerMessage::decode(&PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![body] }.encode())
+    };
+    let sets = |count: u64| (1..=count).map(|from| PeerShapes { from, places: places(2) }).collect();
+    state(sets(16), vec![0.5; 40]).unwrap();
+    assert!(state(sets(17), Vec::new()).is_err());
+    let mut twice: Vec<PeerShapes> = sets(2);
+    twice[1].from = 1;
+    assert!(state(twice, Vec::new()).is_err());
+    assert!(state(vec![PeerShapes { from: 3, places: vec![x] }], Vec::new()).is_err());
+    assert!(state(sets(1), vec![f64::NAN]).is_err() && state(sets(1), vec![0.0; 5000]).is_err());
 }
 
 /// A datagram of a peer with `held` hands and `impulses` at one tick, which says that it has one

@@ -1,12 +1,14 @@
 //! Valid bytes of every kind of external input.
 
-use pliant_modal::{ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig, Relaxation};
+use pliant_modal::{
+    ContactMemory, ContactState, FixedObstacle, FixedShape, GrabConfig, HeldPlace, Relaxation,
+};
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
     HostMessage, ImpulseAt, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerHandState,
-    PeerMessage, ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes, StateCheck,
-    TargetEntry, Targets, TickFrame,
+    PeerMessage, PeerShapes, ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes,
+    StateCheck, TargetEntry, Targets, TickFrame,
 };
 use pliant_stream::{Newmark, RigidState, StepSettings, Surroundings};
 
@@ -83,6 +85,11 @@ pub(super) fn contacts() -> ContactState {
         toward: [0.0; 3],
     };
     ContactState { weight: 0.75, lost: 0.5, memory: vec![memory(3), memory(9)] }
+}
+
+/// Places of which shapes of held patches are made.
+pub(super) fn places(count: u32) -> Vec<HeldPlace> {
+    (0..count).map(|vertex| HeldPlace { vertex, radius: 0.25, way: [0.1, 0.0, -0.2] }).collect()
 }
 
 /// An obstacle of every shape.
@@ -172,6 +179,8 @@ pub(super) fn real_inputs() -> Vec<Vec<u8>> {
             viscoelastic: [0.0; 3],
         }],
         contacts: contacts(),
+        s: vec![0.5; 3],
+        shapes: vec![PeerShapes { from: 5, places: places(2) }, PeerShapes { from: 9, places: places(1) }],
     };
     let hello = PeerMessage::Hello {
         version: 4,
@@ -183,6 +192,7 @@ pub(super) fn real_inputs() -> Vec<Vec<u8>> {
     };
     all.push(hello.encode());
     all.push(PeerMessage::Welcome { user: 2, others: vec![(3, "elsewhere".into())] }.encode());
+    all.push(PeerMessage::Shapes { body: 1, from: 0, places: places(4) }.encode());
     all.push(PeerMessage::State { tick: 7, now: 9, more: false, bodies: vec![body] }.encode());
     all.push(b"12.5\nlost # a comment\n13\n".to_vec());
     all.push(bar(2, 0.05).to_bytes());

@@ -139,6 +139,8 @@ fn a_state_that_nobody_asked_for_is_not_taken() {
             frame: None,
             pulls: Vec::new(),
             contacts: ContactState::default(),
+            s: Vec::new(),
+            shapes: Vec::new(),
         };
         let tick = p.confirmed();
         let lie = PeerMessage::State { tick, now: p.tick(), more: false, bodies: vec![body] }.encode();

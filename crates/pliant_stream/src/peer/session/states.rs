@@ -101,7 +101,9 @@ impl PeerSession {
         if user > self.config.user || unsettled || check.tick > self.confirmed() {
             return;
         }
-        let Some((own, size)) = self.bodies.get(&check.body).and_then(|b| b.check(check.tick)) else {
+        // What waits for shapes differs until it has them.
+        let body = self.bodies.get(&check.body).filter(|body| !body.lacks_shapes(check.tick));
+        let Some((own, size)) = body.and_then(|body| body.check(check.tick)) else {
             return;
         };
         let agrees = (own - f64::from(check.value)).abs() <= CHECK_TOLERANCE * size + 1e-7;
