@@ -12,6 +12,7 @@ use pliant_mesh::shapes;
 use pliant_modal::{Elasticity, Material, ModalModel};
 use pliant_stream::RecoveryConfig;
 use pliant_stream::emulator::{LinkConfig, Preset};
+use pliant_stream::peer::LateInputRepair;
 
 fn bar(material: Option<Material>) -> Arc<ModalModel> {
     let mesh = shapes::bar([8, 2, 2], [0.4, 0.08, 0.08]).unwrap();
@@ -42,6 +43,41 @@ fn a_guest_sees_a_reduced_body_as_well_as_a_linear_one() {
     assert!(reduced.force_rms_percent < 1.5 * linear.force_rms_percent.max(0.1));
     assert!(reduced.kbit_s < 1.1 * linear.kbit_s, "{} and {}", linear.kbit_s, reduced.kbit_s);
     assert!(reduced.end_percent < 0.1 && reduced.missing == linear.missing);
+}
+
+/// The host, the guests and the peers have the own shapes of the patches that are held.
+#[test]
+fn a_session_with_own_shapes_of_held_patches_is_seen_as_well_as_one_without() {
+    let model = bar(Some(Material::NeoHookean));
+    let kinds = [(Elasticity::Linear, false), (Elasticity::Reduced, true)];
+    for between_peers in [false, true] {
+        let [linear, shaped] = kinds.map(|(elasticity, held_shapes)| {
+            let link = LinkConfig::preset(Preset::Paper1);
+            let hands = Experiment::default_hands(&model)[..1].to_vec();
+            let recovery = RecoveryConfig::default();
+            let own = Experiment::new(model.clone(), link, recovery);
+            let experiment = Experiment { elasticity, held_shapes, hands, seconds: 10.0, ..own };
+            if between_peers {
+                experiment.run_peers(LateInputRepair::Rollback).unwrap()
+            } else {
+                experiment.run().unwrap()
+            }
+        });
+        let name = if between_peers { "peers" } else { "guest" };
+        println!(
+            "{name}: {:.4} and {:.4} %, {:.1} and {:.1} bytes, {:.2} and {:.2} N",
+            linear.rms_percent,
+            shaped.rms_percent,
+            linear.bytes_per_frame,
+            shaped.bytes_per_frame,
+            linear.force_scale,
+            shaped.force_scale
+        );
+        assert!(shaped.rms_percent < 1.2 * linear.rms_percent.max(0.1), "{}", shaped.rms_percent);
+        assert!(shaped.bytes_per_frame < 1.1 * linear.bytes_per_frame, "{}", shaped.bytes_per_frame);
+        assert!(shaped.force_rms_percent < 1.5 * linear.force_rms_percent.max(0.1));
+        assert!(shaped.hash != linear.hash && shaped.force_scale != linear.force_scale);
+    }
 }
 
 #[test]

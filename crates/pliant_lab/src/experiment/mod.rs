@@ -46,6 +46,10 @@ pub struct Experiment {
     pub modes: Option<u16>,
     /// How the body resists deformation. Default: linear.
     pub elasticity: Elasticity,
+    /// A body with reduced elasticity has the own shapes of the patches that are held
+    /// ([`HeldShapes`](pliant_modal::HeldShapes)): at the host, at a guest that holds it, and
+    /// between peers. They are made at once, without time in the session. Default: false.
+    pub held_shapes: bool,
     /// The host's integrator. Default: [`RecoveryConfig::integrator`].
     pub integrator: Integrator,
     /// Relaxation of the material. Default: none, elastic.
@@ -213,6 +217,7 @@ impl Experiment {
             seed: 1,
             modes: None,
             elasticity: Elasticity::Linear,
+            held_shapes: false,
             integrator: recovery.integrator(),
             relaxation: None,
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },

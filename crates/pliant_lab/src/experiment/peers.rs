@@ -2,20 +2,24 @@
 //! peer.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::GrabConfig;
+use pliant_modal::{GrabConfig, HeldPlace, HeldShapes};
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
 use super::run::force_error;
-use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, norm};
+use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, model_error, norm};
 
 /// Interval at which a peer's application updates its session.
 const LOOK: Duration = Duration::from_millis(5);
 /// Time by which both peers have joined and hold the body.
 const SETTLED: Duration = Duration::from_secs(3);
+
+/// Number of sets of shapes that are kept.
+const SETS: usize = 16;
 
 /// Reactions of the hands, N, with their users.
 type Reactions = Vec<(UserId, [f64; 3])>;
@@ -104,6 +108,7 @@ impl Experiment {
         let mut agreed = Agreed::default();
         // The positions of the second peer's first hand that no force has answered yet.
         let (mut unanswered, mut answered) = (VecDeque::<(Duration, [f64; 3])>::new(), Duration::ZERO);
+        let mut sets: Vec<(Vec<HeldPlace>, Option<Arc<HeldShapes>>)> = Vec::new();
         let mut now = Duration::ZERO;
         let until = SETTLED + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
         let (mut spent, mut sent) = (Duration::ZERO, [(0_u64, 0_u64); 2]);
@@ -138,6 +143,22 @@ impl Experiment {
                     && let (Some(clock), Some(began)) = (self.cpu_clock, began)
                 {
                     spent += clock().saturating_sub(began);
+                }
+                if self.held_shapes {
+                    for (body, places) in peers[k].shapes_to_make() {
+                        // One peer's shapes are the other's.
+                        let made = sets.iter().find(|(of, _)| *of == places).map(|(_, made)| made.clone());
+                        let made = match made {
+                            Some(made) => made,
+                            None => HeldShapes::of_places(&self.model, &places)
+                                .map_err(model_error)?
+                                .map(Arc::new),
+                        };
+                        sets.push((places.clone(), made.clone()));
+                        peers[k].take_shapes(body, &places, made);
+                    }
+                    let excess = sets.len().saturating_sub(SETS);
+                    sets.drain(..excess);
                 }
                 while peers[k].poll_event().is_some() {}
                 if k == 1

@@ -2,6 +2,7 @@
 //! guest.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 use std::time::Duration;
 
 use pliant_modal::{Body, GrabConfig, GrabId, Patch};
@@ -69,6 +70,7 @@ pub(super) struct Run {
     track_axis: usize,
     track_row: Vec<f64>,
     keep_track: bool,
+    held_shapes: bool,
     /// The guest's hand, and its grab once it has begun.
     guest_hand: Option<(HandScript, Option<u16>)>,
     /// Time at which the guest last sent its target.
@@ -131,6 +133,7 @@ impl Run {
             track_axis,
             track_row,
             keep_track: experiment.keep_track,
+            held_shapes: experiment.held_shapes,
             guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
             guest_sent: Duration::ZERO,
             predict_hand: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
@@ -184,6 +187,16 @@ impl Run {
             }
             // The session accepts every finite target.
             Some(grab) => drop(session.set_target(*grab, target)),
+        }
+    }
+
+    /// Gives the guest's own hand the shapes that the host has.
+    fn shape_at_guest(&self, session: &mut GuestSession) {
+        let Some(view) = session.body(BODY).filter(|_| self.guest_hand.is_some()) else { return };
+        let [own, host] = [view.held_shapes().map(|(shapes, _)| shapes), self.body.held_shapes()];
+        if own.map(Arc::as_ptr) != host.map(Arc::as_ptr) && !view.held_places().is_empty() {
+            let shapes = host.cloned();
+            session.set_held_shapes(BODY, shapes);
         }
     }
 
@@ -330,6 +343,10 @@ impl World for Run {
                 let _ = self.body.set_target(id, std::array::from_fn(|k| start[k] + d[k]));
             }
         }
+        // Where none can be made, the body goes on without.
+        if self.held_shapes && self.body.make_held_shapes().is_err() {
+            self.held_shapes = false;
+        }
         if self.body.step().is_err() {
             return;
         }
@@ -384,6 +401,7 @@ impl World for Run {
 
     fn guest_stepped(&mut self, now: Duration, _guest: usize, _stepped: u64, session: &mut GuestSession) {
         self.hold_at_guest(now, session);
+        self.shape_at_guest(session);
         let Some(view) = session.body(BODY) else { return self.stand_still(now) };
         let (Some(shown), Some(confirmed)) = (view.visual(), view.confirmed()) else {
             return self.stand_still(now);
