@@ -68,6 +68,7 @@
 //! | `contact-avian` | no | colliders and rigid bodies of avian3d 0.7, with forces both ways |
 //! | `net` | no | sessions over QUIC |
 //! | `states` | no | the state of the session as a state of Bevy, with `net` |
+//! | `watch` | no | sessions for watchers without number, over relays, with `net` |
 //! | `haptics` | no | haptic devices and the device loop |
 //! | `rerun` | no | the client of the rerun viewer |
 //! | `panel` | no | the live panel (egui) |
@@ -188,6 +189,8 @@ pub mod prelude {
         ToolGrip, ToolOffset, ToolPose, ToolTouch,
     };
     pub use crate::modal::{ModalModel, Patch};
+    #[cfg(feature = "watch")]
+    pub use crate::net::watch::{WatchCommands, WatchPlugin, WatchView};
     #[cfg(feature = "net")]
     pub use crate::net::{SessionCommands, SessionState};
 }

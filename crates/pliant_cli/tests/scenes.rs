@@ -123,11 +123,12 @@ fn a_scene_compiles_nothing_that_it_does_not_need() {
 }
 
 /// Each feature with crates of its own, those crates, and the features that need this feature.
-const FEATURES: [(&str, &[&str], &[&str]); 8] = [
+const FEATURES: [(&str, &[&str], &[&str]); 9] = [
     ("render", &["bevy_render", "bevy_pbr", "bevy_core_pipeline", "wgpu"], &["panel"]),
     ("contact", &["pliant_contact"], &["contact-mesh"]),
     ("contact-mesh", &["parry3d-f64"], &[]),
-    ("net", &["pliant_net", "quinn*"], &[]),
+    ("net", &["pliant_net", "quinn*"], &["watch"]),
+    ("watch", &["moq-net", "web-transport-*"], &[]),
     ("haptics", &["pliant_haptics"], &[]),
     ("rerun", &["pliant_rerun", "rerun", "re_*", "arrow"], &[]),
     ("panel", &["pliant_panel", "bevy_egui", "egui", "egui_plot"], &[]),

@@ -74,6 +74,8 @@ mod shared_body;
 pub mod transport;
 mod user;
 mod view;
+#[cfg(feature = "watch")]
+pub mod watch;
 
 pub use metrics::{
     DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,

@@ -98,6 +98,8 @@ pub struct NetHost {
     ledger: Ledger,
     /// New bodies, with their models and the tasks that encode the models' files.
     files: BTreeMap<Entity, (Arc<ModalModel>, Task<Arc<[u8]>>)>,
+    #[cfg(feature = "watch")]
+    watch: Option<crate::watch::HostWatch>,
 }
 
 impl NetHost {
@@ -143,6 +145,8 @@ impl NetHost {
             scratch: Vec::new(),
             ledger: Ledger::default(),
             files: BTreeMap::new(),
+            #[cfg(feature = "watch")]
+            watch: None,
         });
         Ok(())
     }
@@ -223,6 +227,35 @@ impl NetHost {
     /// the key identifies a user.
     pub fn known(&self) -> impl Iterator<Item = (Fingerprint, UserId)> + '_ {
         self.known.in_order().into_iter()
+    }
+
+    /// Publishes the session to watchers without number, at a relay ([`watch`](crate::watch)), in
+    /// place of where it was published before. The relay is connected in the background, again and
+    /// again if it is lost, and no tick waits for it.
+    ///
+    /// # Errors
+    /// [`WatchError`](crate::watch::WatchError) for settings outside their ranges, a relay's address
+    /// that is none, or where no thread can be started.
+    #[cfg(feature = "watch")]
+    pub fn publish_to_watchers(
+        &mut self,
+        options: crate::watch::PublishOptions,
+    ) -> Result<(), crate::watch::WatchError> {
+        let step = self.session.config().newmark.h;
+        self.watch = Some(crate::watch::HostWatch::start(options, step)?);
+        Ok(())
+    }
+
+    /// Publishes to watchers no longer. For them the session is over.
+    #[cfg(feature = "watch")]
+    pub fn stop_publishing(&mut self) {
+        self.watch = None;
+    }
+
+    /// How and where the session is published to watchers. `None` if it is not.
+    #[cfg(feature = "watch")]
+    pub fn published(&self) -> Option<(&crate::watch::PublishOptions, crate::watch::PublishStats)> {
+        self.watch.as_ref().map(|watch| (watch.options(), watch.stats()))
     }
 
     /// Kicks a guest. Returns false for an entity that is not a guest.

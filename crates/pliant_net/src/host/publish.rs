@@ -56,6 +56,7 @@ pub(crate) fn publish(
     tick: Res<PliantTick>,
     bodies: SharedBodies,
     grabs: Query<(&Grab, &GrabForce, Option<&GuestGrab>)>,
+    #[cfg(feature = "watch")] views: Query<&crate::watch::WatchView>,
 ) {
     let Some(mut host) = host else { return };
     let host = &mut *host;
@@ -89,6 +90,8 @@ pub(crate) fn publish(
             let Ok((grab, force, guest)) = grabs.get(grab_entity) else { continue };
             let key = guest.map_or_else(|| host.own_key(grab_entity), |guest| guest.key);
             held.insert(grab_entity);
+            #[cfg(feature = "watch")]
+            host.show_hand(id, key, grab, force, views.get(entity).ok());
             let grab = GrabState {
                 key,
                 vertex: grab.vertex,
@@ -120,6 +123,18 @@ pub(crate) fn publish(
             resting: state.is_resting(),
         };
         let published = host.session.publish(now, id, &step);
+        #[cfg(feature = "watch")]
+        if let Some(watch) = &mut host.watch {
+            watch.body(&crate::watch::Seen {
+                id,
+                name: &shared.name,
+                model: state.model(),
+                warps: state.warps(),
+                placement: placement_of(transform),
+                view: views.get(entity).ok(),
+                state: &step,
+            });
+        }
         host.scratch = streamed;
         if let Some(hosted) = host.bodies.get_mut(&entity) {
             match published {
@@ -133,6 +148,8 @@ pub(crate) fn publish(
         }
     }
     host.own_grabs.retain(|entity, _| held.contains(entity));
+    #[cfg(feature = "watch")]
+    host.finish_watch(tick.0);
     host.flush();
 }
 
@@ -201,6 +218,43 @@ impl NetHost {
                 None
             }
         }
+    }
+
+    /// Shows a hand to watchers who see its body.
+    #[cfg(feature = "watch")]
+    fn show_hand(
+        &mut self,
+        body: BodyId,
+        key: GrabKey,
+        grab: &Grab,
+        force: &GrabForce,
+        view: Option<&crate::watch::WatchView>,
+    ) {
+        if let Some(watch) = &mut self.watch
+            && !view.is_some_and(|view| view.hidden)
+        {
+            let (target, reaction) = (grab.target.into(), force.force.into());
+            watch.hand(crate::watch::WatchHand { body, key, target, reaction });
+        }
+    }
+
+    /// Tells watchers the numbers of the session, after all bodies of a tick.
+    #[cfg(feature = "watch")]
+    fn finish_watch(&mut self, tick: pliant_stream::Tick) {
+        let Some(mut watch) = self.watch.take() else { return };
+        let inside = self.guests.iter().filter(|(_, guest)| guest.entity.is_some());
+        let links: Vec<_> = inside.filter_map(|(&peer, _)| self.link(peer)).map(|(link, _)| link).collect();
+        let mean = |of: &dyn Fn(&pliant_stream::LinkStats) -> f64| {
+            links.iter().map(of).sum::<f64>() / (links.len() as f64).max(1.0)
+        };
+        let numbers = crate::watch::WatchNumbers {
+            people: self.users.len().min(usize::from(u16::MAX)) as u16,
+            loss: (!links.is_empty()).then(|| mean(&|link| link.loss_out)),
+            round_trip: mean(&|link| link.round_trip.as_secs_f64()),
+            dropped: 0,
+        };
+        watch.finish(tick, numbers);
+        self.watch = Some(watch);
     }
 
     /// Sends a body's transform to the guests.

@@ -56,7 +56,7 @@ pub const MAX_FRAME: usize = 1 << 18;
 
 /// Most frames that a watcher reads of one group of a body. A publisher begins a new group long
 /// before: a group that does not end is not kept in memory anywhere.
-pub const MAX_GROUP_FRAMES: usize = 1 << 13;
+pub const MAX_GROUP_FRAMES: usize = 1 << 10;
 
 /// Largest model or surface that is published and assembled, bytes.
 pub const MAX_MODEL: usize = 30 << 20;

@@ -1,0 +1,404 @@
+//! A session through a relay to watchers: what they see, late, after losses, and from liars.
+//!
+//! The relay is in this process. Where `PLIANT_MOQ_RELAY` names the program `moq-relay`, the test
+//! `the_same_through_a_real_relay` runs with it, too.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+#[path = "support/relay.rs"]
+mod relay;
+mod support;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bevy::math::{DQuat, DVec3};
+use bevy::prelude::*;
+use moq_net::{Timestamp, origin};
+use pliant_body::{BodyState, Grab, GrabOf, PliantTick, VisualState};
+use pliant_modal::ModalModel;
+use pliant_net::watch::{
+    PublishOptions, RelayOptions, WatchCommands, WatchEvent, WatchPlugin, WatchState, WatchView, Watcher,
+};
+use pliant_net::{HostConfig, NetHost, NetPlugin, RemoteHands};
+use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, Hands, WatchConfig};
+use pliant_stream::{BodyId, Placement, TickState};
+use relay::{Certificate, TestRelay};
+use support::{TIP, alone, app, bar, body_of, host, must, run_until, tick, wait_for};
+
+const NAME: &str = "lectures/bar";
+
+fn options(relay: &TestRelay) -> RelayOptions {
+    RelayOptions::new(relay.address(), NAME).with_certificate(&relay.hash).unwrap()
+}
+
+/// A host that publishes at a relay, with a hand on its body that goes round.
+struct Publisher {
+    app: App,
+    body: Entity,
+    hand: Entity,
+    began: Instant,
+    /// The host's coordinates by tick.
+    truth: BTreeMap<u64, Vec<f64>>,
+}
+
+impl Publisher {
+    fn start(options: PublishOptions) -> Self {
+        let (mut app, _, body) = host(HostConfig::default());
+        // The host's session begins with the first frame.
+        app.update();
+        app.world_mut().resource_mut::<NetHost>().publish_to_watchers(options).unwrap();
+        let at = DVec3::Y + DQuat::from_rotation_z(0.5) * (2.0 * DVec3::new(0.9, 0.0, 0.0));
+        let hand = app.world_mut().spawn((Grab::new(TIP, 0.3, at), GrabOf(body))).id();
+        Self { app, body, hand, began: Instant::now(), truth: BTreeMap::new() }
+    }
+
+    fn update(&mut self) {
+        std::thread::sleep(Duration::from_millis(3));
+        let time = self.began.elapsed().as_secs_f64();
+        let off = DVec3::new(0.9, 0.2 * (3.0 * time).sin(), 0.15 * (2.0 * time).cos());
+        if let Some(mut grab) = self.app.world_mut().get_mut::<Grab>(self.hand) {
+            grab.target = DVec3::Y + DQuat::from_rotation_z(0.5) * (2.0 * off);
+        }
+        self.app.update();
+        let tick = self.app.world().resource::<PliantTick>().0;
+        let q = self.app.world().get::<BodyState>(self.body).unwrap().body().q().to_vec();
+        self.truth.insert(tick, q);
+    }
+}
+
+/// What a watcher has seen so far.
+#[derive(Default)]
+struct Seen {
+    catalogs: Vec<Catalog>,
+    models: BTreeMap<BodyId, Arc<ModalModel>>,
+    states: Vec<(u64, Vec<f64>)>,
+    hands: Vec<Hands>,
+    over: u32,
+    wrong: Vec<String>,
+    connected: u32,
+}
+
+impl Seen {
+    fn take(&mut self, watcher: &mut Watcher) {
+        while let Some(event) = watcher.poll() {
+            match event {
+                WatchEvent::Relay(connected) => self.connected += u32::from(connected),
+                WatchEvent::Catalog(catalog) => self.catalogs.push(catalog),
+                WatchEvent::Body(body, model) => drop(self.models.insert(body.id, model)),
+                WatchEvent::State(_, state) => self.states.push((state.tick, state.q)),
+                WatchEvent::Hands(hands) => self.hands.push(hands),
+                WatchEvent::Over => self.over += 1,
+                WatchEvent::Wrong(what) => self.wrong.push(what),
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Largest difference of any vertex between two states, as a share of the body's size.
+fn off(model: &ModalModel, a: &[f64], b: &[f64]) -> f64 {
+    let vertices = model.surface().positions().len() as u32;
+    let apart = |v| {
+        let [a, b] = [a, b].map(|q| DVec3::from(model.vertex_position(v, q, true).unwrap()));
+        a.distance(b)
+    };
+    (0..vertices).map(apart).fold(0.0, f64::max) / model.size()
+}
+
+/// The whole way, through any relay: every frame is the host's shape at its tick, a late watcher
+/// sees the next frames, hands and numbers are those of the host, and the end is told.
+fn the_session_comes_through(at: RelayOptions) {
+    let mut publish = PublishOptions::new(at.clone());
+    publish.title = "A bar".into();
+    publish.bodies.rate = 20.0;
+    let mut host = Publisher::start(publish);
+    let mut watcher = Watcher::open(&at, Vec::new()).unwrap();
+    let mut seen = Seen::default();
+    wait_for("forty frames", || {
+        host.update();
+        seen.take(&mut watcher);
+        must!(seen.states.len() >= 40, "{} frames, wrong: {:?}", seen.states.len(), seen.wrong);
+        Ok(())
+    });
+    assert_eq!(seen.catalogs.last().unwrap().name, "A bar");
+    let entry = seen.catalogs.last().unwrap().bodies[0].clone();
+    assert_eq!((entry.name.as_str(), entry.every, entry.modes), ("bar", 2, 4));
+    assert!((entry.placement.scale - 2.0).abs() < 1e-6);
+    let model = &seen.models[&entry.id];
+    assert_eq!(model.hash(), bar().hash());
+    let errors: Vec<f64> = seen.states.iter().map(|(t, q)| off(model, q, &host.truth[t])).collect();
+    let worst = errors.iter().copied().fold(0.0, f64::max);
+    let moved = seen.states.iter().map(|(_, q)| off(model, q, &[0.0; 4])).fold(0.0, f64::max);
+    println!("{} frames, off by {worst:.1e} of the size while it moves by {moved:.2}", errors.len());
+    assert!(worst < 2e-4 && moved > 0.1);
+    let gaps = seen.states.windows(2).filter(|pair| pair[1].0 != pair[0].0 + 2).count();
+    assert_eq!(gaps, 0, "no frame is missing");
+    let hand = seen.hands.iter().rev().find(|hands| !hands.hands.is_empty()).unwrap();
+    assert_eq!((hand.numbers.people, hand.numbers.loss), (1, None));
+    assert!(DVec3::from(hand.hands[0].target).distance(DVec3::Y) < 3.0);
+    assert!(seen.hands.iter().flat_map(|h| &h.hands).any(|h| DVec3::from(h.reaction).length() > 0.1));
+
+    // Who comes late begins with the newest group.
+    let mut late = Watcher::open(&at, Vec::new()).unwrap();
+    let (mut seen_late, opened) = (Seen::default(), tick(&host.app));
+    wait_for("a late watcher's frames", || {
+        host.update();
+        seen.take(&mut watcher);
+        seen_late.take(&mut late);
+        must!(seen_late.states.len() > 20, "{} frames", seen_late.states.len());
+        Ok(())
+    });
+    let first = seen_late.states[0].0;
+    // A group is a second, which is 40 ticks, and one that ended 0.3 s before may come first.
+    assert!(first + 53 > opened, "begins with tick {first}, and was opened at {opened}");
+
+    let (_, stats) = host.app.world().resource::<NetHost>().published().unwrap();
+    println!("{stats:?}");
+    assert!(stats.connected && stats.dropped == 0);
+    drop(host);
+    wait_for("the end", || {
+        seen.take(&mut watcher);
+        seen.over > 0
+    });
+    assert!(seen.wrong.is_empty() && seen_late.wrong.is_empty(), "{:?}", seen.wrong);
+}
+
+#[test]
+fn a_session_comes_through_a_relay() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    the_session_comes_through(options(&relay));
+}
+
+/// With the program `moq-relay` that `PLIANT_MOQ_RELAY` names.
+#[test]
+fn the_same_through_a_real_relay() {
+    let Some(program) = std::env::var_os("PLIANT_MOQ_RELAY") else {
+        println!("skipped: PLIANT_MOQ_RELAY does not name the program moq-relay");
+        return;
+    };
+    let _alone = alone();
+    let port = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let at = format!("127.0.0.1:{port}");
+    let mut relay = std::process::Command::new(program)
+        .args(["--listen", &at, "--listen-tls-generate", "localhost", "--web-http-listen", &at])
+        .args(["--auth-public", "**"])
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let hash = wait_for("the relay's certificate", || {
+        use std::io::{Read, Write};
+        let mut line = std::net::TcpStream::connect(&at).ok()?;
+        line.write_all(b"GET /certificate.sha256 HTTP/1.0\r\n\r\n").ok()?;
+        let mut answer = String::new();
+        line.read_to_string(&mut answer).ok()?;
+        answer.split("\r\n\r\n").nth(1).map(|hash| hash.trim().to_owned()).filter(|hash| hash.len() == 64)
+    });
+    let address = format!("https://{at}/");
+    the_session_comes_through(RelayOptions::new(address, NAME).with_certificate(&hash).unwrap());
+    let _ = relay.kill();
+    let _ = relay.wait();
+}
+
+/// The relay is killed and started again, and then the host: the picture comes again by itself.
+#[test]
+fn relays_and_hosts_that_start_again_are_found_again() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    let (port, certificate, at) = (relay.port, relay.certificate.clone(), options(&relay));
+    let mut host = Publisher::start(PublishOptions::new(at.clone()));
+    let mut watcher = Watcher::open(&at, Vec::new()).unwrap();
+    let mut seen = Seen::default();
+    wait_for("the first frames", || {
+        host.update();
+        seen.take(&mut watcher);
+        seen.states.len() > 10
+    });
+    drop(relay);
+    let silent = Instant::now();
+    while silent.elapsed() < Duration::from_secs(1) {
+        host.update();
+        seen.take(&mut watcher);
+    }
+    let before = seen.states.last().unwrap().0;
+    let relay = TestRelay::start_again(port, certificate);
+    let back = Instant::now();
+    wait_for("frames after the relay's restart", || {
+        host.update();
+        seen.take(&mut watcher);
+        must!(seen.states.last().unwrap().0 > before + 40, "{:?}", seen.wrong);
+        Ok(())
+    });
+    println!("the relay was there again for {:?} when frames came", back.elapsed());
+
+    let session = seen.catalogs.last().unwrap().session;
+    drop(host);
+    let mut host = Publisher::start(PublishOptions::new(at));
+    let back = Instant::now();
+    wait_for("the new host's catalog and frames", || {
+        host.update();
+        let before = seen.states.len();
+        seen.take(&mut watcher);
+        let new = seen.catalogs.last().unwrap().session != session;
+        must!(new && seen.states.len() > before, "over: {}, wrong: {:?}", seen.over, seen.wrong);
+        Ok(())
+    });
+    println!("the host was there again for {:?} when frames came", back.elapsed());
+    drop(relay);
+}
+
+/// The relay itself publishes nonsense beside a true session: the watcher says so each time, stays
+/// alive, and shows what is true.
+#[test]
+fn what_a_relay_invents_is_left_out_and_told() {
+    let _alone = alone();
+    let model = bar();
+    let invented = model.clone();
+    let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
+        let broadcast = origin.publish(NAME, origin::Route::default()).unwrap();
+        tokio::task::spawn_local(nonsense(broadcast, invented));
+    });
+    let at = options(&relay);
+    let mut watcher = Watcher::open(&at, Vec::new()).unwrap();
+    let mut seen = Seen::default();
+    let wanted = ["catalog", "too long", "watched", "hands", "group is full"];
+    wait_for("all the nonsense, and the truth beside it", || {
+        std::thread::sleep(Duration::from_millis(3));
+        seen.take(&mut watcher);
+        let missing: Vec<_> = wanted.iter().filter(|w| !seen.wrong.iter().any(|s| s.contains(*w))).collect();
+        must!(missing.is_empty(), "not told of {missing:?}, but of {:?}", seen.wrong);
+        must!(seen.states.iter().any(|(tick, _)| *tick > 1000), "no true frame");
+        Ok(())
+    });
+    println!("told: {:?}", seen.wrong.iter().collect::<std::collections::BTreeSet<_>>());
+    assert!(seen.states.iter().all(|(_, q)| q.iter().all(|q| q.is_finite())));
+    assert!(seen.models.values().all(|got| got.hash() == model.hash()));
+}
+
+async fn nonsense(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
+    let track = |name: &str| broadcast.create_track(name, None).unwrap();
+    let (mut catalogs, mut hands) = (track("catalog"), track("hands"));
+    let mut body = track("body/1");
+    let files = track(&pliant_stream::watch::model_track(model.hash()));
+    let false_files = track(&pliant_stream::watch::model_track(pliant_modal::ModelHash([7; 32])));
+    let now = Timestamp::now;
+    let bytes = model.to_bytes();
+    for files in [&files, &false_files] {
+        let mut group = files.append_group().unwrap();
+        for piece in pliant_stream::watch::pieces(&bytes) {
+            group.write_frame(now(), piece.to_vec()).unwrap();
+        }
+        group.finish().unwrap();
+    }
+    let entry = CatalogBody {
+        id: BodyId(1),
+        name: "a bar".into(),
+        model: model.hash(),
+        file_bytes: bytes.len() as u64,
+        surface_bytes: 0,
+        modes: 4,
+        every: 1,
+        warps: true,
+        free: false,
+        placement: Placement::default(),
+        color: [0; 4],
+    };
+    let other = pliant_modal::ModelHash([7; 32]);
+    let false_one = CatalogBody { id: BodyId(2), model: other, ..entry.clone() };
+    let huge = CatalogBody { id: BodyId(3), model: other, file_bytes: u64::MAX, ..entry.clone() };
+    let bodies = vec![entry, false_one, huge];
+    let catalog = Catalog { session: 1, step: 0.025, name: "lies".into(), bodies, cameras: Vec::new() };
+    let mut encoder = BodyEncoder::new(&model, WatchConfig { rate: 40.0, ..WatchConfig::default() }, 0.025);
+    let encoder = encoder.as_mut().unwrap();
+    for round in 0_u64.. {
+        let good = catalog.encode();
+        catalogs.write_frame(now(), vec![round as u8; 33]).unwrap();
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        catalogs.write_frame(now(), good).unwrap();
+        hands.write_frame(now(), vec![0xff; 40]).unwrap();
+        // Too long, cut off, out of nothing, and without end.
+        body.write_frame(now(), vec![1; 300_000]).unwrap();
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        encoder.restart();
+        let q = [0.01; 4];
+        let state =
+            |tick| TickState { tick, q: &q, v: &[], a: &[], z: &[], pose: None, grabs: &[], resting: false };
+        let first = encoder.encode(&state(2000 + 100 * round)).unwrap().unwrap().bytes;
+        body.write_frame(now(), first[..first.len() - 2].to_vec()).unwrap();
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        body.write_frame(now(), vec![4; 3]).unwrap();
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        let mut group = body.append_group().unwrap();
+        group.write_frame(now(), first).unwrap();
+        let next = encoder.encode(&state(2001 + 100 * round)).unwrap().unwrap().bytes;
+        if round == 3 {
+            // More frames than a group may have, slowly enough to be read.
+            for k in 0..4000 {
+                if group.write_frame(now(), next.clone()).is_err() {
+                    break;
+                }
+                if k % 200 == 0 {
+                    tokio::time::sleep(Duration::from_millis(5)).await;
+                }
+            }
+        } else {
+            group.write_frame(now(), next).unwrap();
+        }
+        let _ = group.finish();
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// In Bevy: the body appears where the host has it, moves as the host's does, and goes with the
+/// session.
+#[test]
+fn an_app_watches_a_session() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    let at = options(&relay);
+    let mut host = Publisher::start(PublishOptions::new(at.clone()));
+    let view = WatchView { color: Srgba::rgb(1.0, 0.0, 0.0), hidden: false };
+    host.app.world_mut().entity_mut(host.body).insert(view);
+    let mut watching = app(NetPlugin::default());
+    watching.add_plugins(WatchPlugin);
+    watching.world_mut().commands().watch_session(at);
+    let mut shown: Vec<Vec<f64>> = Vec::new();
+    let there = wait_for("the body moves in the watching app", || {
+        host.update();
+        watching.update();
+        let wrong = watching.world().resource::<WatchState>().wrong.clone();
+        let there = body_of(&mut watching).ok_or_else(|| format!("no body, {wrong:?}"))?;
+        shown.push(watching.world().get::<VisualState>(there).unwrap().q().to_vec());
+        must!(shown.len() > 300, "{} pictures", shown.len());
+        Ok(there)
+    });
+    let model = bar();
+    // Each picture is the host's shape of some tick, up to the straight line between two frames.
+    let near = |q: &Vec<f64>| host.truth.values().map(|truth| off(&model, q, truth)).fold(1.0, f64::min);
+    let moved = shown.iter().map(|q| off(&model, q, &[0.0; 4])).fold(0.0, f64::max);
+    let worst = shown.iter().rev().take(100).map(near).fold(0.0, f64::max);
+    println!("moves by {moved:.2} of the size, off by {worst:.1e}");
+    // The hand goes 0.015 of the size in a tick, and a frame of the host may make two ticks.
+    assert!(moved > 0.1 && worst < 0.02);
+    let different = shown.windows(2).filter(|pair| pair[0] != pair[1]).count();
+    assert!(different > shown.len() / 2, "{different} of {} pictures are new", shown.len());
+    let place = watching.world().get::<Transform>(there).unwrap();
+    assert!(place.translation.distance(Vec3::Y) < 1e-6 && (place.scale.x - 2.0).abs() < 1e-6);
+    assert_eq!(watching.world().get::<WatchView>(there).unwrap().color, Srgba::rgb(1.0, 0.0, 0.0));
+    let hands = watching.world().get::<RemoteHands>(there).unwrap();
+    assert_eq!(hands.0.len(), 1);
+    let state = watching.world().resource::<WatchState>();
+    assert!(state.connected && state.numbers.people == 1 && state.wrong.0 == 0, "{state:?}");
+    // What a watcher does reaches nobody: its own hand on the body moves nothing at the host.
+    assert_eq!(host.app.world().resource::<NetHost>().session().users().count(), 0);
+
+    host.app.world_mut().resource_mut::<NetHost>().stop_publishing();
+    run_until(&mut [&mut host.app, &mut watching], "the body goes with the session", |apps| {
+        body_of(apps[1]).is_none()
+    });
+    watching.world_mut().commands().stop_watching();
+    watching.update();
+    assert_eq!(*watching.world().resource::<WatchState>(), WatchState::default());
+}
