@@ -243,8 +243,8 @@ impl CarrierPort {
     }
 
     /// Makes a carrier for joining the session that another end hosts. The first event is
-    /// [`Event::Connected`], or [`Event::Closed`] if the other end has not admitted this one within
-    /// [`Limits::handshake`].
+    /// [`Event::Connected`](super::Event::Connected), or [`Event::Closed`](super::Event::Closed) if
+    /// the other end has not admitted this one within [`Limits::handshake`].
     ///
     /// The attempt begins with this call, or when the other end is there, and not when a session
     /// takes the carrier up: make it when the session is to begin. A connection of a session on

@@ -2,8 +2,8 @@
 //!
 //! A host publishes its session to a relay ([`NetHost::publish_to_watchers`]). Relays cache it and
 //! pass it on, to other relays and to whoever watches: apps with
-//! [`WatchCommands::watch_session`], or anything else that reads the formats. The host pays for one stream, whatever the number of watchers. Nothing that a watcher sends
-//! reaches the host.
+//! [`WatchCommands::watch_session`], or anything else that reads the formats. The host pays for one
+//! stream, whatever the number of watchers. Nothing that a watcher sends reaches the host.
 //!
 //! What crosses is [`pliant_stream::watch`]; the page `docs/watching.md` has it byte by byte.
 //!
