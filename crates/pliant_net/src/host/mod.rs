@@ -234,8 +234,8 @@ impl NetHost {
     /// again if it is lost, and no tick waits for it.
     ///
     /// # Errors
-    /// [`WatchError`](crate::watch::WatchError) for settings outside their ranges, a relay's address
-    /// that is none, or where no thread can be started.
+    /// [`WatchError`](crate::watch::WatchError) for settings outside their ranges, an address that
+    /// is no relay's, or where no thread can be started.
     #[cfg(feature = "watch")]
     pub fn publish_to_watchers(
         &mut self,
