@@ -172,7 +172,7 @@ impl Body {
     /// Sets the value that [`mean_reaction`](Self::mean_reaction) returns. The next step uses this
     /// value.
     ///
-    /// A copy of a body that takes over a [`State`] must take over this value too.
+    /// A copy of a body that takes over a [`State`](crate::State) must take over this value too.
     ///
     /// # Errors
     /// Returns an error if there is no such grab or a number is not finite.
@@ -200,7 +200,7 @@ impl Body {
     ///
     /// It is the `z` of the compliance that the modes leave out, and holds the creep under the
     /// forces so far. It is zero where the material does not relax. A copy of a body that takes
-    /// over a [`State`] must take over this value too.
+    /// over a [`State`](crate::State) must take over this value too.
     ///
     /// # Errors
     /// Returns [`StepError::NoGrab`] if there is no such grab.
