@@ -55,6 +55,7 @@ fn app() -> App {
         HapticsPlugin::default(),
         NetPlugin::host(HostConfig::default()).unwrap(),
         BakePlugin { cache: None },
+        WatchPlugin,
     ));
     app
 }
@@ -179,6 +180,7 @@ import! {
     Relaxation, Released, RideOn, RidingPlugin, SessionCommands, SessionState, SingleSteps, StepSettings,
     SurfaceAnchor, SurfaceDeformation, SurfaceDetail, SurfacePlace, SurfaceShading, Teleport,
     ToolGrabs, ToolGrip, ToolOffset, ToolPose, ToolTouch, TouchBodies, TouchProbe, VisualState,
+    WatchCommands, WatchPlugin, WatchView,
 }
 
 #[test]

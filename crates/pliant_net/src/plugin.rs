@@ -161,6 +161,8 @@ impl Plugin for NetPlugin {
             .register_type::<UserLeft>()
             .add_message::<UserJoined>()
             .add_message::<UserLeft>();
+        #[cfg(feature = "watch")]
+        app.register_type::<crate::watch::WatchView>();
         // The systems of all roles are there, and those of the role that the app has run.
         app.add_systems(PreStartup, session::start)
             .add_systems(PreUpdate, session::follow.run_if(session::is_busy).in_set(NetSystems::Receive))

@@ -34,13 +34,16 @@ const MARGIN: Duration = Duration::from_millis(40);
 pub struct WatchPlugin;
 
 /// Where the app stands with the session that it watches.
-#[derive(Resource, Debug, Default, Clone, PartialEq)]
+#[derive(Resource, Reflect, Debug, Default, Clone, PartialEq)]
+#[reflect(Resource, Debug, Default, Clone, PartialEq)]
 pub struct WatchState {
     /// Whether a relay is connected.
     pub connected: bool,
     /// The catalog of the session. `None` while the host is not there.
+    #[reflect(ignore)]
     pub catalog: Option<Catalog>,
     /// People, loss, round trip, and what the host has dropped.
+    #[reflect(ignore)]
     pub numbers: WatchNumbers,
     /// Number of frames that have arrived.
     pub frames: u64,
@@ -112,6 +115,7 @@ fn stop(world: &mut World) {
 impl Plugin for WatchPlugin {
     fn build(&self, app: &mut App) {
         app.init_resource::<WatchState>()
+            .register_type::<WatchState>()
             .register_type::<WatchView>()
             .register_type::<RemoteBody>()
             .register_type::<RemoteHands>()

@@ -75,7 +75,7 @@ impl PublishOptions {
 /// How watchers see a [`SharedBody`](crate::SharedBody) of the host. Bodies without this component
 /// are shown in light gray.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Component, Debug, Clone, PartialEq)]
+#[reflect(Component, Debug, Clone, PartialEq, Default)]
 pub struct WatchView {
     /// Color and opacity. Default: light gray.
     pub color: Srgba,
