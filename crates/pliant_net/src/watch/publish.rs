@@ -65,8 +65,9 @@ impl PublishOptions {
         }
     }
 
-    /// Link to a page that shows the session. `page` is the address of a page that reads `relay`
-    /// and `session` from the fragment of its own address.
+    /// Link to a page that shows the session. `page` is the address of the page that `pliant
+    /// watch-page` writes, or of another one that reads `relay`, `session` and any number of
+    /// `certificate` (SHA-256 hashes) from the fragment of its own address.
     pub fn link(&self, page: &str) -> String {
         self.relay.link(page, self.link_relay.as_ref().unwrap_or(&self.relay.relay))
     }
@@ -488,13 +489,16 @@ fn serve(request: track::Request, models: &BTreeMap<ModelHash, (Arc<ModalModel>,
             for piece in pieces(&bytes) {
                 group.write_frame(Timestamp::ZERO, piece.to_vec())?;
             }
-            group.finish()?;
-            track.finish()
+            group.finish()
         };
         if let Err(error) = write() {
             tracing::debug!("a model was not published: {error}");
         }
-        // The track stays as long as somebody reads it, and is asked for again after that.
+        // The track stays as long as somebody reads it, and is asked for again after that. It does
+        // not end before: the library of browsers drops a group that comes after the track's end,
+        // and the two are on streams of their own. Who asks reads a moment later.
+        tokio::time::sleep(KEEP).await;
         let _ = track.unused().await;
+        let _ = track.finish();
     });
 }

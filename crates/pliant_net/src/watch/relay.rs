@@ -83,15 +83,22 @@ impl RelayOptions {
     }
 
     /// Link to a page that shows the session: `page` with the relay and the session in its
-    /// fragment, which browsers send to no web server. A token in the relay's address is in the
-    /// link too, so publish with another one than watchers get, with
-    /// [`PublishOptions::link_relay`](super::PublishOptions::link_relay).
+    /// fragment, which browsers send to no web server, and the hashes of certificates to trust. A
+    /// token in the relay's address is in the link too, so publish with another one than watchers
+    /// get, with [`PublishOptions::link_relay`](super::PublishOptions::link_relay).
     pub(super) fn link(&self, page: &str, relay: &str) -> String {
-        let fragment = url::form_urlencoded::Serializer::new(String::new())
-            .append_pair("relay", relay)
-            .append_pair("session", &self.session)
-            .finish();
-        format!("{page}#{fragment}")
+        let mut fragment = url::form_urlencoded::Serializer::new(String::new());
+        fragment.append_pair("relay", relay).append_pair("session", &self.session);
+        // Another relay has another certificate.
+        if let RelayTrust::Certificates(hashes) = &self.trust
+            && relay == self.relay
+        {
+            for hash in hashes {
+                let hex: String = hash.iter().map(|byte| format!("{byte:02x}")).collect();
+                fragment.append_pair("certificate", &hex);
+            }
+        }
+        format!("{page}#{}", fragment.finish())
     }
 
     pub(super) fn open(&self) -> Result<Relay, WatchError> {

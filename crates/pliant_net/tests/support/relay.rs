@@ -89,7 +89,12 @@ impl Drop for TestRelay {
 impl Certificate {
     pub fn new() -> Self {
         let key = rcgen::KeyPair::generate().unwrap();
-        let parameters = rcgen::CertificateParams::new(vec!["127.0.0.1".into()]).unwrap();
+        let mut parameters = rcgen::CertificateParams::new(vec!["127.0.0.1".into()]).unwrap();
+        // Browsers take a certificate by its hash if it is valid for two weeks at most.
+        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap();
+        let day = Duration::from_hours(24);
+        parameters.not_before = rcgen::date_time_ymd(1970, 1, 1) + (now - day);
+        parameters.not_after = parameters.not_before + 10 * day;
         let der = parameters.self_signed(&key).unwrap().der().to_vec();
         Self { der, key: key.serialize_der() }
     }
