@@ -30,6 +30,7 @@ mod report;
 mod simulate;
 mod stability;
 mod stream;
+mod watch_page;
 
 use std::process::ExitCode;
 
@@ -66,6 +67,8 @@ enum Command {
     Stability(stability::StabilityArgs),
     /// Streams a body over an emulated network and measures the guest's view
     Stream(stream::StreamArgs),
+    /// Writes the page that shows a published session in a browser
+    WatchPage(watch_page::WatchPageArgs),
 }
 
 fn main() -> ExitCode {
@@ -81,6 +84,7 @@ fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::Stream(args) => stream::run(&args),
+        Command::WatchPage(args) => watch_page::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -110,6 +114,8 @@ enum CliError {
     NoFolder(std::path::PathBuf),
     #[error("--output: cannot write {path}: {source}")]
     Output { path: std::path::PathBuf, source: std::io::Error },
+    #[error("cannot write the page to {path}: {source}")]
+    Page { path: std::path::PathBuf, source: std::io::Error },
     #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
     #[error("{0}")]

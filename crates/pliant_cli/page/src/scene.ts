@@ -1,0 +1,282 @@
+// Draws bodies, hands and forces. The vertex shader sums the modes, so a frame of a body uploads
+// its coordinates and nothing else.
+
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import type { Catalog, CatalogBody, Hand, State, Surface } from "./format";
+
+const VERTEX = /* glsl */ `
+precision highp float;
+precision highp sampler2D;
+uniform sampler2D displacement;
+uniform sampler2D rotation;
+uniform sampler2D coordinates;
+uniform int modes;
+uniform int vertices;
+uniform int across;
+uniform bool warps;
+out vec3 toEye;
+out vec3 shaded;
+
+void main() {
+  vec3 d = vec3(0.0);
+  vec3 w = vec3(0.0);
+  for (int k = 0; k < modes; k++) {
+    float q = texelFetch(coordinates, ivec2(k, 0), 0).r;
+    int index = k * vertices + gl_VertexID;
+    ivec2 at = ivec2(index % across, index / across);
+    d += q * texelFetch(displacement, at, 0).xyz;
+    w += q * texelFetch(rotation, at, 0).xyz;
+  }
+  // Modal warping (Choi and Ko 2005).
+  float s = dot(w, w);
+  float t = sqrt(s);
+  bool small = s < 0.01;
+  float a = small ? 0.5 - s / 24.0 + s * s / 720.0 : (1.0 - cos(t)) / s;
+  float b = small ? 1.0 / 6.0 - s / 120.0 + s * s / 5040.0 : (t - sin(t)) / (s * t);
+  float c = small ? 1.0 - s / 6.0 + s * s / 120.0 : sin(t) / t;
+  vec3 bent = warps ? d + a * cross(w, d) + b * cross(w, cross(w, d)) : d;
+  // The normal at rest, turned as the surface turns here.
+  vec3 turned = normal + c * cross(w, normal) + a * cross(w, cross(w, normal));
+  vec4 seen = modelViewMatrix * vec4(position + bent, 1.0);
+  toEye = -seen.xyz;
+  shaded = normalMatrix * turned;
+  gl_Position = projectionMatrix * seen;
+}
+`;
+
+const FRAGMENT = /* glsl */ `
+precision highp float;
+uniform vec3 color;
+uniform float opacity;
+in vec3 toEye;
+in vec3 shaded;
+out vec4 drawn;
+
+void main() {
+  vec3 eye = normalize(toEye);
+  vec3 n = normalize(shaded);
+  if (dot(n, eye) < 0.0) n = -n;
+  vec3 key = normalize(vec3(0.4, 0.8, 0.6));
+  float light = 0.35 + 0.65 * max(dot(n, key), 0.0);
+  float shine = pow(max(dot(n, normalize(key + eye)), 0.0), 40.0);
+  vec3 lit = color * light + 0.18 * shine;
+  // From linear light to what screens show.
+  drawn = vec4(pow(lit, vec3(1.0 / 2.2)), opacity);
+}
+`;
+
+/** A texture of whole rows, for texelFetch. */
+function texture(values: Float32Array, channels: 1 | 4, across: number): THREE.DataTexture {
+  const count = values.length / channels;
+  const down = Math.max(1, Math.ceil(count / across));
+  const data = new Float32Array(across * down * channels);
+  data.set(values);
+  const format = channels === 4 ? THREE.RGBAFormat : THREE.RedFormat;
+  const made = new THREE.DataTexture(data, across, down, format, THREE.FloatType);
+  made.needsUpdate = true;
+  return made;
+}
+
+function widened(rows: Float32Array): Float32Array {
+  const out = new Float32Array((rows.length / 3) * 4);
+  for (let k = 0, at = 0; k < rows.length; k += 3, at += 4) out.set(rows.subarray(k, k + 3), at);
+  return out;
+}
+
+/** A model on the graphics card, for all of its bodies. */
+export class Model {
+  readonly surface: Surface;
+  readonly geometry = new THREE.BufferGeometry();
+  readonly across: number;
+  readonly displacement: THREE.DataTexture;
+  readonly rotation: THREE.DataTexture;
+
+  constructor(surface: Surface, largest: number) {
+    this.surface = surface;
+    const rows = (surface.modes * surface.positions.length) / 3;
+    this.across = Math.max(1, Math.min(4096, largest, rows));
+    if (Math.ceil(rows / this.across) > largest) throw new Error("a model is too large for this graphics card");
+    this.displacement = texture(widened(surface.displacement), 4, this.across);
+    this.rotation = texture(widened(surface.rotation), 4, this.across);
+    this.geometry.setAttribute("position", new THREE.BufferAttribute(surface.positions, 3));
+    this.geometry.setIndex(new THREE.BufferAttribute(surface.triangles, 1));
+    this.geometry.computeVertexNormals();
+  }
+
+  dispose(): void {
+    this.geometry.dispose();
+    this.displacement.dispose();
+    this.rotation.dispose();
+  }
+}
+
+/** A body that is drawn. */
+export class Drawn {
+  readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.RawShaderMaterial | THREE.ShaderMaterial>;
+  #coordinates: THREE.DataTexture;
+  #values: Float32Array;
+  #body: CatalogBody;
+
+  constructor(body: CatalogBody, model: Model) {
+    this.#body = body;
+    this.#values = new Float32Array(Math.max(1, model.surface.modes));
+    this.#coordinates = texture(this.#values, 1, this.#values.length);
+    const [r, g, b, a] = body.color;
+    const color = new THREE.Color().setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace);
+    const material = new THREE.ShaderMaterial({
+      glslVersion: THREE.GLSL3,
+      vertexShader: VERTEX,
+      fragmentShader: FRAGMENT,
+      side: THREE.DoubleSide,
+      transparent: a < 255,
+      uniforms: {
+        displacement: { value: model.displacement },
+        rotation: { value: model.rotation },
+        coordinates: { value: this.#coordinates },
+        modes: { value: model.surface.modes },
+        vertices: { value: model.surface.positions.length / 3 },
+        across: { value: model.across },
+        warps: { value: body.warps },
+        color: { value: color },
+        opacity: { value: a / 255 },
+      },
+    });
+    this.mesh = new THREE.Mesh(model.geometry, material);
+    // The shader moves the vertices, so the bounds at rest say nothing.
+    this.mesh.frustumCulled = false;
+    this.mesh.position.set(...body.position);
+    this.mesh.quaternion.set(...body.orientation);
+    this.mesh.scale.setScalar(body.scale);
+  }
+
+  /** Draws the body between two states, `part` of the way from the first to the second. */
+  show(from: State, to: State, part: number): void {
+    const data = this.#coordinates.image.data as Float32Array;
+    for (let k = 0; k < data.length; k++) {
+      const [a, b] = [from.q[k] ?? 0, to.q[k] ?? 0];
+      data[k] = a + (b - a) * part;
+    }
+    this.#coordinates.needsUpdate = true;
+    if (this.#body.free && from.position && to.position && from.rotation && to.rotation) {
+      const position = new THREE.Vector3(...from.position).lerp(new THREE.Vector3(...to.position), part);
+      // Poses are in the body's own meters.
+      this.mesh.position.copy(position.multiplyScalar(this.#body.scale));
+      const turned = new THREE.Quaternion(...from.rotation);
+      this.mesh.quaternion.copy(turned.slerp(new THREE.Quaternion(...to.rotation), part));
+    }
+  }
+
+  dispose(): void {
+    this.mesh.material.dispose();
+    this.#coordinates.dispose();
+  }
+}
+
+/** The color of a user: as in the apps, a golden angle apart. */
+export function colorOf(user: number): THREE.Color {
+  return new THREE.Color().setHSL(((200 + 137.50776 * user) % 360) / 360, 0.7, 0.55);
+}
+
+/** The scene with its camera. */
+export class Stage {
+  readonly renderer: THREE.WebGLRenderer;
+  readonly scene = new THREE.Scene();
+  readonly camera = new THREE.PerspectiveCamera(45, 1, 0.001, 1000);
+  readonly controls: OrbitControls;
+  #hands = new Map<string, { ball: THREE.Mesh; arrow: THREE.ArrowHelper }>();
+  #ball = new THREE.SphereGeometry(1, 20, 14);
+  #framed = false;
+  #size = 1;
+
+  constructor(canvas: HTMLCanvasElement) {
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    this.scene.background = new THREE.Color(0x16181d);
+    // One finger turns, two move and zoom.
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = true;
+    this.camera.position.set(0.3, 0.25, 0.5);
+  }
+
+  get largestTexture(): number {
+    return this.renderer.capabilities.maxTextureSize;
+  }
+
+  /** Looks from the catalog's first camera, or so that all bodies are in the picture. */
+  frame(catalog: Catalog, drawn: Iterable<Drawn>): void {
+    if (this.#framed) return;
+    const bounds = new THREE.Box3();
+    for (const one of drawn) {
+      one.mesh.geometry.computeBoundingBox();
+      one.mesh.updateWorldMatrix(true, false);
+      bounds.union(one.mesh.geometry.boundingBox!.clone().applyMatrix4(one.mesh.matrixWorld));
+    }
+    if (bounds.isEmpty()) return;
+    this.#framed = true;
+    this.#size = bounds.getSize(new THREE.Vector3()).length();
+    this.camera.near = this.#size / 200;
+    this.camera.far = this.#size * 200;
+    const view = catalog.cameras[0];
+    if (view) {
+      this.camera.fov = (view.fieldOfView * 180) / Math.PI;
+      this.camera.position.set(...view.eye);
+      this.controls.target.set(...view.at);
+    } else {
+      const middle = bounds.getCenter(new THREE.Vector3());
+      this.controls.target.copy(middle);
+      this.camera.position.copy(middle).add(new THREE.Vector3(0.5, 0.4, 1).multiplyScalar(1.1 * this.#size));
+    }
+    this.camera.updateProjectionMatrix();
+    this.controls.update();
+  }
+
+  /** Draws the hands and their forces. The strongest force is as long as a third of the scene. */
+  showHands(hands: Hand[], strongest: number): void {
+    const present = new Set<string>();
+    for (const hand of hands) {
+      const key = `${hand.body}/${hand.user}/${hand.grab}`;
+      present.add(key);
+      let shown = this.#hands.get(key);
+      if (!shown) {
+        const color = colorOf(hand.user);
+        const ball = new THREE.Mesh(this.#ball, new THREE.MeshBasicMaterial({ color }));
+        const arrow = new THREE.ArrowHelper(undefined, undefined, 1, color);
+        shown = { ball, arrow };
+        this.#hands.set(key, shown);
+        this.scene.add(ball, arrow);
+      }
+      shown.ball.position.set(...hand.target);
+      shown.ball.scale.setScalar(0.015 * this.#size);
+      const force = new THREE.Vector3(...hand.reaction);
+      const size = force.length();
+      shown.arrow.visible = size > 0;
+      if (size > 0) {
+        const length = (0.33 * this.#size * size) / Math.max(strongest, size);
+        shown.arrow.position.copy(shown.ball.position);
+        shown.arrow.setDirection(force.divideScalar(size));
+        shown.arrow.setLength(length, Math.min(0.05 * this.#size, 0.3 * length), 0.02 * this.#size);
+      }
+    }
+    for (const [key, { ball, arrow }] of this.#hands) {
+      if (present.has(key)) continue;
+      this.scene.remove(ball, arrow);
+      (ball.material as THREE.Material).dispose();
+      arrow.dispose();
+      this.#hands.delete(key);
+    }
+  }
+
+  draw(): void {
+    const canvas = this.renderer.domElement;
+    const [wide, high] = [canvas.clientWidth, canvas.clientHeight];
+    const ratio = this.renderer.getPixelRatio();
+    if (canvas.width !== Math.floor(wide * ratio) || canvas.height !== Math.floor(high * ratio)) {
+      this.renderer.setSize(wide, high, false);
+      this.camera.aspect = wide / Math.max(1, high);
+      this.camera.updateProjectionMatrix();
+    }
+    this.controls.update();
+    this.renderer.render(this.scene, this.camera);
+  }
+}
