@@ -55,6 +55,10 @@ struct Options {
     #[arg(long, default_value_t = 8.0)]
     rate: f64,
 
+    #[cfg(feature = "watch")]
+    #[command(flatten)]
+    watchers: session::publish::Publish,
+
     /// Write the state of every tick to this file, for `join --compare`.
     #[arg(long)]
     trace: Option<PathBuf>,
@@ -105,6 +109,8 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     if options.play {
         app.world_mut().entity_mut(body).insert(session::Script::of(0));
     }
+    #[cfg(feature = "watch")]
+    options.watchers.add_to(&mut app)?;
     if let Some(file) = &options.trace {
         app.insert_resource(session::trace::Trace::create(file)?)
             .add_systems(FixedUpdate, session::trace::write_truth.after(PliantSystems::Publish));

@@ -4,6 +4,8 @@
 //! window.
 #![allow(dead_code, reason = "each example uses the part that it needs")]
 
+#[cfg(feature = "watch")]
+pub mod publish;
 pub mod serve;
 pub mod trace;
 
@@ -62,7 +64,8 @@ pub fn headless(level: Level) -> App {
     let mut app = App::new();
     app.add_plugins((
         MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(2))),
-        LogPlugin { level, ..default() },
+        // The library of relays tells of every track that is asked for.
+        LogPlugin { level, filter: format!("{},moq_net=warn", bevy::log::DEFAULT_FILTER), ..default() },
         TerminalCtrlCHandlerPlugin,
         AssetPlugin { file_path: ASSETS.into(), ..default() },
         TransformPlugin,
@@ -242,12 +245,17 @@ pub fn end(
 
 /// Returns the processor time, s, and the memory, MB, of this process if the system reports them.
 pub fn used() -> Option<(f64, f64)> {
-    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
+    used_by("self")
+}
+
+/// As [`used`], of the process with a number.
+pub fn used_by(process: &str) -> Option<(f64, f64)> {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
     // After the name in parentheses, fields 14 and 15 are the ticks in user and in system mode, 10
     // ms each.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = |at: usize| fields.get(at)?.parse::<f64>().ok();
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).ok()?;
     let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
     let kilobytes: f64 = resident.trim().trim_end_matches("kB").trim().parse().ok()?;
     Some(((ticks(11)? + ticks(12)?) / 100.0, kilobytes / 1e3))

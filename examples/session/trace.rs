@@ -131,6 +131,13 @@ fn read(path: &Path) -> Result<BTreeMap<(u64, u16), Line>, Box<dyn Error>> {
     }
 }
 
+/// Returns the true modal coordinates by tick, from a host's file that may still grow.
+pub fn truth(path: &Path) -> Result<BTreeMap<u64, Vec<f32>>, Box<dyn Error>> {
+    let host = UserId::HOST.0;
+    let lines = read(path)?.into_iter().filter(|((_, user), _)| *user == host);
+    Ok(lines.map(|((tick, _), line)| (tick, line.q)).collect())
+}
+
 /// Errors of shown shapes, and the largest true displacement.
 #[derive(Default)]
 struct Off {

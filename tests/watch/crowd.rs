@@ -1,0 +1,135 @@
+//! Many watchers of one session in one process: what each hears and misses, how late it comes, and
+//! what other processes (the relay, the host) cost meanwhile. `tests/watch/load.sh` runs it.
+//!
+//! ```sh
+//! watch_crowd RELAY CERTIFICATE SESSION BODY.modal WATCHERS SECONDS [NAME=PID...]
+//! ```
+//!
+//! Prints a line of JSON. Delays are behind the earliest arrival of any tick at any watcher, by the
+//! host's count of ticks: the path's own delay on loopback is not in them.
+#![allow(missing_docs, reason = "a program for measurements")]
+
+#[path = "../../examples/session/mod.rs"]
+mod session;
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::path::Path;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use pliant::net::watch::{RelayOptions, WatchEvent, Watcher};
+
+/// What one watcher hears.
+#[derive(Default)]
+struct Heard {
+    first_picture: Option<Duration>,
+    /// First and last tick within the measured time, and the number of those heard.
+    first: u64,
+    last: u64,
+    count: u64,
+    wrong: u64,
+    over: u64,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let given: Vec<String> = std::env::args().skip(1).collect();
+    let [relays, certificate, name, body, watchers, seconds, processes @ ..] = &given[..] else {
+        return Err("expected RELAY,.. CERTIFICATE SESSION BODY WATCHERS SECONDS [NAME=PID...]".into());
+    };
+    let (watchers, seconds): (usize, f64) = (watchers.parse()?, seconds.parse()?);
+    let model = session::model(Path::new(body))?;
+    let relays: Vec<&str> = relays.split(',').collect();
+    let began = Instant::now();
+    let mut crowd = Vec::new();
+    for k in 0..watchers {
+        let options = RelayOptions::new(relays[k % relays.len()], name)
+            .with_certificate(certificate)
+            .ok_or("CERTIFICATE is no hash")?;
+        crowd.push((Instant::now(), Watcher::open(&options, vec![model.clone()])?, Heard::default()));
+        // Not all handshakes in one moment.
+        sleep(Duration::from_millis(5));
+    }
+    let (mut step, mut every) = (0.0, 1);
+    // A few seconds until everybody has the first picture, then the measured time.
+    let mut measured: Option<(Instant, BTreeMap<&str, (f64, f64)>)> = None;
+    let mut late: Vec<f64> = Vec::new();
+    loop {
+        let now = Instant::now();
+        if let Some((since, _)) = &measured
+            && (now - *since).as_secs_f64() > seconds
+        {
+            break;
+        }
+        let mut idle = true;
+        for (opened, watcher, heard) in &mut crowd {
+            while let Some(event) = watcher.poll() {
+                idle = false;
+                match event {
+                    WatchEvent::Catalog(catalog) => {
+                        step = catalog.step;
+                        every = catalog.bodies.first().map_or(1, |body| u64::from(body.every));
+                    }
+                    WatchEvent::State(_, state) => {
+                        heard.first_picture.get_or_insert(opened.elapsed());
+                        if measured.is_some() {
+                            if heard.count == 0 {
+                                heard.first = state.tick;
+                            }
+                            heard.last = heard.last.max(state.tick);
+                            heard.count += 1;
+                            late.push(began.elapsed().as_secs_f64() - state.tick as f64 * step);
+                        }
+                    }
+                    WatchEvent::Wrong(_) => heard.wrong += 1,
+                    WatchEvent::Over => heard.over += 1,
+                    _ => {}
+                }
+            }
+        }
+        let all = crowd.iter().all(|(_, _, heard)| heard.first_picture.is_some());
+        if measured.is_none() && (all || began.elapsed() > Duration::from_secs(90)) {
+            let used = processes.iter().filter_map(|one| {
+                let (name, pid) = one.split_once('=')?;
+                Some((name, session::used_by(pid)?))
+            });
+            measured = Some((now, used.collect()));
+        }
+        if idle {
+            sleep(Duration::from_millis(1));
+        }
+    }
+    let Some((since, before)) = measured else { return Err("nothing was measured".into()) };
+    let passed = since.elapsed().as_secs_f64();
+    late.sort_by(f64::total_cmp);
+    let part = |of: &[f64], share: f64| of.get((of.len() as f64 * share) as usize).copied().unwrap_or(0.0);
+    let earliest = late.first().copied().unwrap_or(0.0);
+    let mut pictures: Vec<f64> =
+        crowd.iter().filter_map(|(_, _, heard)| Some(heard.first_picture?.as_secs_f64())).collect();
+    pictures.sort_by(f64::total_cmp);
+    let heard: u64 = crowd.iter().map(|(_, _, heard)| heard.count).sum();
+    let due = |heard: &Heard| if heard.count == 0 { 0 } else { (heard.last - heard.first) / every + 1 };
+    let missing: u64 = crowd.iter().map(|(_, _, heard)| due(heard).saturating_sub(heard.count)).sum();
+    let mut costs = String::new();
+    for one in processes {
+        let Some((name, pid)) = one.split_once('=') else { continue };
+        if let (Some((then, memory_then)), Some((now, memory))) = (before.get(name), session::used_by(pid)) {
+            let share = 100.0 * (now - then) / passed;
+            costs.push_str(&format!(
+                ",\"{name}\":{{\"processor_percent\":{share:.1},\"memory_mb\":[{memory_then:.0},{memory:.0}]}}"
+            ));
+        }
+    }
+    println!(
+        "{{\"watchers\":{watchers},\"with_picture\":{},\"first_picture_s\":[{:.2},{:.2}],\"seconds\":{passed:.1},\
+         \"heard\":{heard},\"missing\":{missing},\"delay_ms\":[{:.1},{:.1}],\"wrong\":{},\"over\":{}{costs}}}",
+        pictures.len(),
+        part(&pictures, 0.5),
+        pictures.last().copied().unwrap_or(0.0),
+        1e3 * (part(&late, 0.5) - earliest),
+        1e3 * (part(&late, 0.99) - earliest),
+        crowd.iter().map(|(_, _, heard)| heard.wrong).sum::<u64>(),
+        crowd.iter().map(|(_, _, heard)| heard.over).sum::<u64>(),
+    );
+    Ok(())
+}

@@ -1,0 +1,67 @@
+#!/bin/sh
+# What a session costs by the number of its watchers: the host, one relay or a cluster of two, and
+# the delay and the missing frames of the watchers, all on this machine over loopback. Prints a line
+# of JSON for each number of watchers.
+#
+#   tests/watch/load.sh BODY.modal [SECONDS [WATCHERS...]]
+#
+# RELAYS=2: two relays, of which the second fetches from the first, with half of the watchers each.
+# Needs moq-relay 0.17.10 (PLIANT_MOQ_RELAY, or in PATH), openssl and Linux; ends with 77 (skipped)
+# without. Programs: those of BIN (a target folder's debug/ or release/), or built by cargo.
+set -u
+skip() { echo "skipped: $1"; exit 77; }
+[ -r /proc/self/stat ] || skip "needs Linux"
+command -v openssl >/dev/null || skip "no openssl"
+relay=${PLIANT_MOQ_RELAY:-$(command -v moq-relay)}
+[ -x "$relay" ] || skip "no moq-relay (cargo install moq-relay --version 0.17.10)"
+body=$(realpath "${1:?which body}")
+seconds=${2:-20}
+[ $# -ge 2 ] && shift 2 || shift $#
+watchers=${*:-1 10 100}
+cd "$(dirname "$0")/../.."
+if [ -z "${BIN:-}" ]; then
+    cargo build --release -p pliant_examples --no-default-features --features watch \
+        --example dedicated_server --example watch_crowd || exit 2
+    BIN=$(cargo metadata --format-version 1 --no-deps |
+        sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
+fi
+work=$(mktemp -d)
+pids=""
+stop() { for pid in $pids; do kill "$pid" 2>/dev/null; done; wait; pids=""; }
+trap 'stop; rm -rf "$work"' EXIT
+trap 'exit 130' INT TERM HUP
+openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 10 -subj /CN=localhost \
+    -addext subjectAltName=IP:127.0.0.1 -keyout "$work/key" -out "$work/certificate" 2>/dev/null || exit 2
+hash=$(openssl x509 -in "$work/certificate" -outform der | openssl dgst -sha256 -r | cut -d' ' -f1)
+start() { # port, more arguments
+    port=$1
+    shift
+    "$relay" --listen "127.0.0.1:$port" --listen-tls-cert "$work/certificate" \
+        --listen-tls-key "$work/key" --auth-public '**' "$@" >>"$work/relay.log" 2>&1 &
+    pids="$pids $!"
+}
+first=${RELAY_PORT:-4460}
+for n in $watchers; do
+    start "$first"
+    measured="relay=$!"
+    at="https://127.0.0.1:$first/"
+    if [ "${RELAYS:-1}" = 2 ]; then
+        sleep 1
+        start $((first + 1)) --cluster-connect "$at" --connect-tls-fingerprint "$hash"
+        measured="$measured second=$!"
+        at="$at,https://127.0.0.1:$((first + 1))/"
+    fi
+    # The host's ticks are among what is measured, so it goes before the crowd.
+    ${AS:-} "$BIN/examples/dedicated_server" --bind 127.0.0.1:0 --hz 60 --play --body "$body" \
+        --publish "https://127.0.0.1:$first/" --certificate "$hash" --session load >"$work/host.log" 2>&1 &
+    pids="$pids $!"
+    measured="$measured host=$!"
+    sleep 3
+    # shellcheck disable=SC2086
+    "$BIN/examples/watch_crowd" "$at" "$hash" load "$body" "$n" "$seconds" $measured || {
+        tail -3 "$work/relay.log" "$work/host.log" >&2
+        exit 1
+    }
+    tail -1 "$work/host.log"
+    stop
+done

@@ -1,0 +1,159 @@
+// What tests/watch/run.sh runs: starts everything, measures, and ends everything.
+
+import assert from "node:assert/strict";
+import { execFileSync, spawnSync } from "node:child_process";
+import { createHash } from "node:crypto";
+import { createWriteStream, existsSync } from "node:fs";
+import { createServer as listen } from "node:net";
+import { join } from "node:path";
+import { Browser, serve, sleep, start, until } from "./browser.mjs";
+
+const { RELAY, CHROMIUM, BIN, WORK, OUT } = process.env;
+const HZ = 60;
+const body = process.env.BODY ?? "pip.modal";
+
+const freePort = () =>
+  new Promise((done) => {
+    const server = listen();
+    server.listen(0, "127.0.0.1", () => {
+      const { port } = server.address();
+      server.close(() => done(port));
+    });
+  });
+
+const site = join(WORK, "site");
+execFileSync(join(BIN, "pliant"), ["watch-page", site]);
+const pageAddress = await serve(site);
+
+// A certificate that lives longer than a relay: browsers take those of two weeks at most by their hash.
+const [key, certificate] = [join(WORK, "key.pem"), join(WORK, "certificate.pem")];
+const names = "subjectAltName=IP:127.0.0.1,DNS:localhost";
+const request = ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"];
+const about = ["-days", "10", "-subj", "/CN=localhost", "-addext", names, "-keyout", key, "-out", certificate];
+execFileSync("openssl", [...request, ...about], { stdio: "ignore" });
+const der = execFileSync("openssl", ["x509", "-in", certificate, "-outform", "der"]);
+const hash = createHash("sha256").update(der).digest("hex");
+
+const port = await freePort();
+const relayAddress = `https://127.0.0.1:${port}/`;
+function startRelay() {
+  const where = ["--listen", `127.0.0.1:${port}`, "--listen-tls-cert", certificate, "--listen-tls-key", key];
+  const relay = start(RELAY, [...where, "--auth-public", "**"], { stdio: ["ignore", "pipe", "pipe"] });
+  const log = createWriteStream(join(WORK, "relay.log"), { flags: "a" });
+  relay.stdout.pipe(log, { end: false });
+  relay.stderr.pipe(log, { end: false });
+  return relay;
+}
+
+const trace = join(WORK, "truth");
+/** Starts a host, and waits for its link. */
+function startHost() {
+  const host = start(
+    join(BIN, "examples/dedicated_server"),
+    ["--bind", "127.0.0.1:0", "--hz", `${HZ}`, "--body", body, "--play", "--trace", trace].concat(
+      ["--publish", relayAddress, "--certificate", hash, "--page", pageAddress, "--session", "tests/body"],
+    ),
+    { stdio: ["ignore", "pipe", "inherit"] },
+  );
+  let told = "";
+  const link = new Promise((done, failed) => {
+    host.stdout.on("data", (data) => {
+      told += data;
+      const found = /^to watch in a browser: (.*)$/m.exec(told);
+      if (found) done(found[1]);
+    });
+    host.on("exit", () => failed(new Error(`the host ended: ${told}`)));
+  });
+  return { host, link };
+}
+
+const told = {};
+let relay = startRelay();
+let { host, link } = startHost();
+const address = await link;
+assert.ok(address.startsWith(pageAddress) && address.includes(hash), address);
+const browser = new Browser(CHROMIUM, join(WORK, "profile"));
+await browser.open(address);
+await until(browser, "the first picture", () => browser.value("pliant.numbers.firstPicture > 0"));
+told.firstPicture = (await browser.value("pliant.numbers.firstPicture")) / 1000;
+
+// Shapes of what was decoded, against the truth of the same ticks.
+await browser.value("pliant.record()");
+const sofar = () => browser.value("[pliant.numbers.bytes, performance.now()]");
+const [bytesBefore, before] = await sofar();
+await sleep(8000);
+const [bytesAfter, after] = await sofar();
+// Bodies and hands, without what a connection costs.
+told.bytesPerSecond = ((bytesAfter - bytesBefore) / (after - before)) * 1000;
+const [id] = await browser.value("pliant.bodies()");
+const ticks = await browser.value(`pliant.ticks(${id})`);
+const chosen = ticks.filter((_, k) => k % 8 === 0).slice(0, 24);
+assert.ok(chosen.length >= 16, `${ticks.length} frames in 8 s`);
+// The host writes its trace in pieces.
+await sleep(2000);
+const printed = spawnSync(join(BIN, "examples/watch_truth"), [trace, body, ...chosen.map(String)], {
+  maxBuffer: 1 << 30,
+});
+const truth = JSON.parse(printed.stdout);
+let [sum, most, moved, furthest, compared] = [0, 0, 0, chosen[0], 0];
+for (const [tick, positions] of Object.entries(truth.ticks)) {
+  const off = await browser.value(`pliant.compare(${id}, ${tick}, ${JSON.stringify(positions)})`);
+  assert.ok(off, `the page has no tick ${tick}`);
+  compared++;
+  sum += off.rms ** 2;
+  most = Math.max(most, off.most);
+  if (off.moved > moved) [moved, furthest] = [off.moved, Number(tick)];
+}
+assert.ok(compared >= 16, `${compared} ticks are in both`);
+Object.assign(told, {
+  compared,
+  rms: Math.sqrt(sum / compared) / truth.size,
+  largest: most / truth.size,
+  moved: moved / truth.size,
+  frames: ticks.length,
+});
+await browser.value(`pliant.freeze(${furthest})`);
+await sleep(500);
+await browser.picture(join(OUT, "page.png"));
+told.tick = furthest;
+// The host's own picture of that tick, where the program for it is built and something can draw.
+const drawer = join(BIN, "examples/watch_picture");
+if (OUT !== WORK && existsSync(drawer)) {
+  const [wide, high] = await browser.value("[innerWidth, innerHeight]");
+  const given = [trace, body, `${furthest}`, join(OUT, "host.png"), `${wide}`, `${high}`];
+  told.hostPicture = spawnSync(drawer, given, { stdio: ["ignore", "ignore", "inherit"] }).status === 0;
+}
+told.wrong = await browser.value("pliant.numbers.wrong");
+assert.equal(told.wrong, 0, await browser.value("document.getElementById('status').textContent"));
+assert.ok(told.moved > 0.02, `the body moves by ${told.moved} of its size`);
+assert.ok(told.rms < 1e-4 && told.largest < 1e-3, JSON.stringify(told));
+
+/** Whether frames go on: more than a few since the call. */
+async function goesOn(what) {
+  const before = await browser.value("pliant.numbers.frames");
+  return until(browser, what, async () => (await browser.value("pliant.numbers.frames")) > before + 3);
+}
+
+// The line is cut for 10 s: the relay stands still.
+relay.kill("SIGSTOP");
+await sleep(10_000);
+relay.kill("SIGCONT");
+told.afterCut = await goesOn("frames after a cut line");
+
+relay.kill("SIGKILL");
+await sleep(1000);
+relay = startRelay();
+told.afterRelay = await goesOn("frames after another relay");
+
+host.kill("SIGKILL");
+await sleep(1000);
+({ host, link } = startHost());
+await link;
+told.afterHost = await goesOn("frames after another host");
+
+host.kill("SIGTERM");
+await until(browser, "the page without a host", async () =>
+  (await browser.value("document.getElementById('status').textContent")).includes("waiting for the host"),
+);
+console.log(JSON.stringify(told, null, 1));
+process.exit(0);

@@ -1,0 +1,35 @@
+#!/bin/sh
+# A session in a browser, for real: moq-relay, a dedicated_server that publishes, the page that
+# `pliant watch-page` writes, and headless Chromium. The page computes how far its shapes are from
+# the host's truth, and says what it is sent when that is damaged; relay and host are killed and
+# started again, and the line is cut.
+#
+#   tests/watch/run.sh
+#
+# Needs node, openssl, moq-relay 0.17.10 (PLIANT_MOQ_RELAY names it, or it is in PATH: cargo install
+# moq-relay --version 0.17.10) and Chromium (PLIANT_CHROMIUM, or in PATH); ends with 77 (skipped)
+# where one is missing. Programs: those of BIN (a target folder's debug/ or release/), or built by
+# cargo. OUT is a folder for the page's picture. Everything is on loopback, and takes two minutes.
+set -u
+skip() { echo "skipped: $1"; exit 77; }
+here=$(cd "$(dirname "$0")" && pwd)
+for program in node openssl; do
+    command -v $program >/dev/null || skip "no $program"
+done
+relay=${PLIANT_MOQ_RELAY:-$(command -v moq-relay)}
+[ -x "$relay" ] || skip "no moq-relay (cargo install moq-relay --version 0.17.10)"
+chromium=${PLIANT_CHROMIUM:-$(command -v chromium || command -v chromium-browser || command -v google-chrome)}
+[ -x "$chromium" ] || skip "no Chromium"
+cd "$here/../.."
+if [ -z "${BIN:-}" ]; then
+    cargo build --release -p pliant_cli || exit 2
+    cargo build --release -p pliant_examples --no-default-features --features watch \
+        --example dedicated_server --example watch_truth || exit 2
+    BIN=$(cargo metadata --format-version 1 --no-deps |
+        sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
+fi
+work=$(mktemp -d)
+# Chromium's last processes may still write to its profile.
+trap 'rm -rf "$work" 2>/dev/null || { sleep 2; rm -rf "$work"; }' EXIT
+trap 'exit 130' INT TERM HUP
+RELAY=$relay CHROMIUM=$chromium BIN=$BIN WORK=$work OUT=${OUT:-$work} node "$here/run.mjs"
