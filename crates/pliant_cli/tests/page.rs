@@ -215,9 +215,9 @@ fn surface() -> Value {
     })
 }
 
-/// A body's frames over two seconds: smooth courses, jumps that need the long code, values that need
-/// a coarser unit, sleep, and groups that begin anew. All inputs are sums and products of numbers
-/// that are the same on every machine.
+/// A body's frames over two seconds: smooth courses, jumps that need the long code, values that
+/// need a coarser unit, sleep, and groups that begin anew. All inputs are sums and products of
+/// numbers that are the same on every machine.
 fn course(model: &str, rate: f64) -> Value {
     let assets = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets");
     let model = ModalModel::read(assets.join(model)).unwrap();
