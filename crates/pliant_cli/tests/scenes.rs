@@ -189,8 +189,9 @@ fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
 
 /// The crates that a game in a browser may have. What the devices' loops are made of is native, and
 /// the laboratory and the program are no part of a game.
-const IN_BROWSERS: [&str; 10] = [
+const IN_BROWSERS: [&str; 11] = [
     "pliant",
+    "pliant_path",
     "pliant_mesh",
     "pliant_bake",
     "pliant_modal",

@@ -3,6 +3,8 @@
 use std::collections::HashMap;
 use std::ops::RangeInclusive;
 
+use pliant_path::is_below;
+
 use super::error::nearest;
 use super::locate::Step::{self, Field, Item};
 use super::{
@@ -74,35 +76,6 @@ fn name(path: &[Step], name: &str) -> Checked {
     }
     let message = format!("expected a name of 1 to 64 bytes in one line, got {} bytes", name.len());
     Err(fault(path, SceneErrorKind::Value, message))
-}
-
-/// Returns whether a path consists of names of folders and of a file only, with `/` between them,
-/// on every system, whatever system this is. A scene from someone else must not reach beyond its
-/// folder.
-///
-/// The rules are those of `pliant_mesh::io::is_below`, for the files that meshes name. A game that
-/// bakes nothing leaves that crate out, so that they are here once more. A test compares the two.
-fn is_below(path: &str) -> bool {
-    path.len() <= 1024
-        && !path.contains(|c: char| matches!(c, '\\' | ':') || c.is_control())
-        && path.split('/').all(|name| !name.is_empty() && !name.ends_with(['.', ' ']) && !is_device(name))
-}
-
-/// Returns whether Windows takes a name for a device. It ignores what follows the first dot, and
-/// spaces before that.
-fn is_device(name: &str) -> bool {
-    let stem = name.split_once('.').map_or(name, |(stem, _)| stem).trim_end_matches(' ');
-    let is = |device: &&str| stem.eq_ignore_ascii_case(device);
-    if ["CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$", "CLOCK$"].iter().any(is) {
-        return true;
-    }
-    let ports = stem.split_at_checked(3);
-    ports.is_some_and(|(port, number)| {
-        ["COM", "LPT"].iter().any(|device| port.eq_ignore_ascii_case(device))
-            // Windows takes a raised digit for a digit.
-            && matches!(number.chars().next(), Some('0'..='9' | '¹' | '²' | '³'))
-            && number.chars().count() == 1
-    })
 }
 
 /// Checks that a path stays under the folder of assets.

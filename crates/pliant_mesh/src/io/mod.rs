@@ -17,7 +17,6 @@
 //! For any bytes in a file, reading gives a mesh or an error and takes memory in proportion to the
 //! file.
 
-mod below;
 mod cursor;
 mod gltf;
 mod medit;
@@ -41,8 +40,8 @@ use crate::{
     stuff,
 };
 
-pub use below::is_below;
 pub use msh::MshVersion;
+pub use pliant_path::is_below;
 
 /// Largest accepted file, bytes.
 const MAX_FILE: u64 = 1 << 30;

@@ -1,4 +1,8 @@
 //! Paths in files from someone else.
+//!
+//! A scene and a document of a mesh name files by the same rule. It is a crate of its own, without
+//! dependencies, because a game that makes no bodies itself leaves `pliant_mesh` out and still
+//! reads scenes.
 
 /// Longest path, bytes.
 const LONGEST: usize = 1024;
@@ -14,7 +18,7 @@ const LONGEST: usize = 1024;
 /// The function reads only the text. It does not tell whether a link leads out of the folder.
 ///
 /// ```
-/// use pliant_mesh::io::is_below;
+/// use pliant_path::is_below;
 ///
 /// assert!(is_below("folder/skin.bin"));
 /// assert!(!is_below("../skin.bin") && !is_below("C:skin.bin") && !is_below("nul.bin"));
