@@ -71,6 +71,15 @@ fn a_hand_whose_device_was_away_is_told_of_no_more_than_the_body_gives() {
     }
 }
 
+/// In the first of these a peer comes back through a third whose list still has it. In the others a
+/// call arrives late, and its connection stays.
+#[test]
+fn peers_that_come_back_through_a_third_or_late_find_each_other() {
+    for seed in [10535, 2709, 3245, 9119] {
+        run(&FaultKind::ALL, seed, 1);
+    }
+}
+
 #[test]
 fn a_seed_gives_the_same_session_again() {
     let (first, again) = (run(&FaultKind::ALL, 7, 2), run(&FaultKind::ALL, 7, 2));

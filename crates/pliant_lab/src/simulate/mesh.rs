@@ -53,6 +53,8 @@ struct Side {
 #[derive(Debug)]
 struct Wire {
     sides: [Side; 2],
+    /// Until then, what is sent comes late.
+    late_until: Duration,
 }
 
 /// A peer's process.
@@ -236,7 +238,8 @@ impl Mesh {
         self.dial_over(Duration::ZERO, from, to, user);
     }
 
-    /// The same over a path that is slower by so much.
+    /// The same over a path that is slower by so much, for as long: what a call begins with comes
+    /// late, and what follows does not.
     fn dial_over(&mut self, slower: Duration, from: usize, to: usize, user: Option<UserId>) {
         let peer = PeerId(self.wires.len() as u64);
         let own = self.now + self.nodes[from].ahead;
@@ -258,7 +261,7 @@ impl Mesh {
             received: Waiting::default(),
         };
         let sides = [side(from, lives[0], true), side(to, lives[1], false)];
-        self.wires.push(Wire { sides });
+        self.wires.push(Wire { sides, late_until: self.now + slower });
         self.ensure(connected.is_ok(), || format!("process {from} cannot connect: {connected:?}"));
     }
 

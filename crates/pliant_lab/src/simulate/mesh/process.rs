@@ -282,10 +282,14 @@ impl Mesh {
     /// Sends from one side of a connection.
     fn put(&mut self, (index, at): (usize, usize), channel: Channel, packet: Packet) {
         let now = self.now;
-        let sides = &mut self.wires[index].sides;
+        let wire = &mut self.wires[index];
+        let (late, sides) = (now < wire.late_until, &mut wire.sides);
         let bad = sides.iter().any(|side| self.processes.is_disturbed(side.process, now));
         let link = &mut sides[at].links[usize::from(channel == Channel::Message)];
         let path = if bad { disturbed(&self.path) } else { self.path.clone() };
+        if !late && link.config().delay != self.path.delay {
+            let _ = link.reconfigure(LinkConfig { delay: self.path.delay, ..link.config().clone() });
+        }
         let path = LinkConfig { delay: link.config().delay, ..path };
         if channel == Channel::Datagram && *link.config() != path {
             let _ = link.reconfigure(path);
