@@ -4,9 +4,9 @@
 #
 #   tests/stops.sh [PAUSES...]
 #
-# LIGHT=1 sets no bar on the reaction: nobody may be lost, and nothing may panic. CORES=1 keeps
-# every core busy meanwhile. Binaries: those of BIN, or built by cargo. Ends with 77 (skipped) where
-# a tool is missing, and with 1 when a figure is beyond its bar.
+# LIGHT=1 sets no bar on the reaction and the shape: nobody may be lost, and nothing may panic.
+# CORES=1 keeps every core busy meanwhile. Binaries: those of BIN, or built by cargo. Ends with 77
+# (skipped) where a tool is missing, and with 1 when a figure is beyond its bar.
 set -u
 cd "$(dirname "$0")/.."
 skip() { echo "skipped: $1"; exit 77; }
@@ -57,7 +57,11 @@ if grep -qE "panicked|lost the connection" "$work"/*.log; then
     grep -hE "panicked|lost the connection" "$work"/*.log | head -3
     exit 1
 fi
-echo "$result" | sed 's/.*largest reaction \([0-9.]*\) N shown, \([0-9.]*\) N true.*/\1 \2/' | awk -v light="${LIGHT:-}" '{
-    printf "largest reaction shown over the largest true one: %.3f (at most 1.2)\n", $1 / $2
-    exit !($2 > 0 && (light || $1 <= 1.201 * $2))
-}'
+# The server makes 40 ticks a second, and the shape is looked at once a tick.
+echo "$result" |
+    sed 's/.*reaction \([0-9.]*\) N shown, \([0-9.]*\) N true.* for \([0-9]*\) ticks at most$/\1 \2 \3/' |
+    awk -v light="${LIGHT:-}" '{
+        printf "largest reaction shown over the largest true one: %.3f (at most 1.2)\n", $1 / $2
+        printf "shape back within 1 %% after %.3f s (at most 0.525)\n", $3 / 40
+        exit !(NF == 3 && $2 > 0 && (light || ($1 <= 1.201 * $2 && $3 <= 21)))
+    }'

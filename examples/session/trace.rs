@@ -145,10 +145,12 @@ struct Off {
     sum: f64,
     worst: f64,
     largest: f64,
+    /// The ticks, and their errors over the surface (rms).
+    each: Vec<(u64, f64)>,
 }
 
 impl Off {
-    fn add(&mut self, model: &ModalModel, shown: &[f32], truth: &[f32]) {
+    fn add(&mut self, model: &ModalModel, tick: u64, shown: &[f32], truth: &[f32]) {
         let rest = model.surface().positions();
         let shape = |q: &[f32]| {
             let mut q = q.to_vec();
@@ -169,6 +171,7 @@ impl Off {
         }
         self.ticks += 1;
         self.sum += mean;
+        self.each.push((tick, mean.sqrt()));
         self.worst = self.worst.max(most.sqrt());
         self.largest = self.largest.max(moved.sqrt());
     }
@@ -176,7 +179,27 @@ impl Off {
     fn rms(&self) -> f64 {
         percent((self.sum / self.ticks.max(1) as f64).sqrt(), self.largest)
     }
+
+    /// Longest time in which the shape was off by more than a hundredth of the largest
+    /// displacement, in ticks. It is back when it has been right for [`RIGHT_FOR`] shown ticks.
+    fn longest(&self) -> u64 {
+        let (mut longest, mut since, mut right) = (0, None, 0);
+        for &(tick, error) in &self.each {
+            if error > 0.01 * self.largest {
+                let began = *since.get_or_insert(tick);
+                longest = longest.max(tick + 1 - began);
+                right = 0;
+            } else {
+                right += 1;
+                since = since.filter(|_| right < RIGHT_FOR);
+            }
+        }
+        longest
+    }
 }
+
+/// A tenth of a second at forty ticks a second.
+const RIGHT_FOR: u32 = 4;
 
 fn percent(x: f64, of: f64) -> f64 {
     if of > 0.0 { 100.0 * x / of } else { 0.0 }
@@ -186,7 +209,8 @@ fn percent(x: f64, of: f64) -> f64 {
 ///
 /// The errors of the shapes are relative to the largest true displacement, separately for the
 /// streamed body and for the body with the predicted hand. The errors of the reactions are relative
-/// to the largest true reaction. The first `skip` ticks of the guest are left out.
+/// to the largest true reaction. The longest time in which the streamed body was off by more than
+/// 1 % (rms over its surface) is told in ticks. The first `skip` ticks of the guest are left out.
 pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> Result<(), Box<dyn Error>> {
     let (truth, shown) = (read(truth)?, read(shown)?);
     let (mut streamed, mut own) = (Off::default(), Off::default());
@@ -202,7 +226,7 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
         }
         let Some(real) = truth.get(&(tick, host)) else { continue };
         let off = if user == host { &mut streamed } else { &mut own };
-        off.add(model, &line.q, &real.q);
+        off.add(model, tick, &line.q, &real.q);
         if let Some(real) =
             truth.get(&(tick, user)).filter(|real| real.reaction.is_finite() && line.reaction.is_finite())
         {
@@ -225,7 +249,8 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
     println!(
         "{} of {span} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
          predicted hand against the later state of the host, {:.2} % rms; \
-         largest reaction {told:.2} N shown, {given:.2} N true",
+         largest reaction {told:.2} N shown, {given:.2} N true; \
+         shape off by more than 1 % for {} ticks at most",
         streamed.ticks,
         streamed.rms(),
         percent(streamed.worst, streamed.largest),
@@ -233,6 +258,7 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
         percent((force_sum / felt.max(1) as f64).sqrt(), force_most),
         percent(force_worst, force_most),
         own.rms(),
+        streamed.longest(),
     );
     Ok(())
 }
