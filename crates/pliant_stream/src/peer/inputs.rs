@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use pliant_modal::Body;
+
 use crate::prediction::Ring;
 use crate::recovery::Forecast;
 use crate::state::{BodyId, Tick, UserId};
@@ -9,6 +11,12 @@ use crate::wire::{HeldAt, ImpulseAt, InputTick};
 
 /// Number of ticks remembered.
 pub(crate) const WINDOW: usize = 128;
+
+/// Largest number of hands that act on one body, as many as at a host. A step with 32 hands takes
+/// some ten times as long as one with 8, so that a crowd would hold up everybody's frames.
+const MAX_HANDS: usize = Body::MAX_GRABS;
+/// Hands on one body whose square costs as much again as the step of the body without hands.
+const CROWD: u64 = 32;
 
 /// What all users do with one body at one tick, by user.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -147,7 +155,20 @@ impl InputLog {
             let impulses = inputs.at(tick).map_or(&[][..], |input| &input.impulses);
             out.impulses.extend(impulses.iter().filter(|i| i.body == body).map(|i| (*user, *i)));
         }
+        make_room(&mut out.held);
         known
+    }
+
+    /// What the hands of all users add to the cost of a tick that is stepped again, as a number of
+    /// steps without hands: of each body, the square of its hands.
+    pub(crate) fn crowd(&self) -> u64 {
+        let mut hands: BTreeMap<BodyId, u64> = BTreeMap::new();
+        let present = self.users.values().filter(|u| !u.gone);
+        for held in present.filter_map(UserInputs::newest).flat_map(|input| &input.held) {
+            *hands.entry(held.body).or_default() += 1;
+        }
+        let cost = |hands: u64| hands.min(MAX_HANDS as u64).pow(2) / CROWD;
+        hands.into_values().map(cost).sum()
     }
 
     /// The newest tick up to which all inputs are known.
@@ -155,6 +176,25 @@ impl InputLog {
         let each = self.users.values().filter(|u| !u.gone).map(|u| u.complete);
         each.min().unwrap_or(0)
     }
+}
+
+/// Leaves as many hands as act on one body, alike at all peers: each user's first one comes before
+/// anybody's second, and so on. The hands of a user follow each other.
+fn make_room(held: &mut Vec<(UserId, HeldAt)>) {
+    if held.len() <= MAX_HANDS {
+        return;
+    }
+    let mut turns: Vec<(usize, usize)> = Vec::with_capacity(held.len());
+    for (index, (user, _)) in held.iter().enumerate() {
+        let follows = index.checked_sub(1).is_some_and(|before| held[before].0 == *user);
+        let turn = if follows { turns[index - 1].0 + 1 } else { 0 };
+        turns.push((turn, index));
+    }
+    turns.sort_unstable();
+    let mut stays = vec![false; held.len()];
+    turns.iter().take(MAX_HANDS).for_each(|(_, index)| stays[*index] = true);
+    let mut stays = stays.into_iter();
+    held.retain(|_| stays.next() == Some(true));
 }
 
 #[cfg(test)]

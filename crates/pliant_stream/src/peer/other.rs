@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
-use crate::link::{Budget, Link, PatchBudget, pay, state_budget};
+use crate::link::{Budget, Link, PatchBudget, state_budget};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{HeldAt, PeerBodyState};
 
@@ -154,8 +154,17 @@ impl RemotePeer {
     }
 
     /// Pays for what is stepped again for a late input, and returns whether the budgets allow it.
-    pub(super) fn pays_for_late(&mut self, all: &mut SharedBudgets, now: Duration, cost: f64) -> bool {
-        self.budgets.late.spend(now, cost) && pay(&mut all.late, &mut self.share.late, now, cost)
+    ///
+    /// What the hands of all add is paid for from the budget of all, and from nobody's own: those
+    /// who hold with many hands would make the inputs of the others too dear.
+    pub(super) fn pays_for_late(
+        &mut self,
+        all: &mut SharedBudgets,
+        now: Duration,
+        [own, crowd]: [f64; 2],
+    ) -> bool {
+        self.budgets.late.spend(now, own)
+            && (self.share.late.spend(now, own) || all.late.spend_or_owe(now, own + crowd))
     }
 
     /// Pays for a new patch, and returns whether the budgets allow it.
@@ -218,12 +227,12 @@ mod tests {
             let now = begun + tick * Duration::from_millis(25);
             let (last, others) = peers.split_last_mut().unwrap();
             for other in others {
-                while other.pays_for_late(&mut all, now, 11.0) {
+                while other.pays_for_late(&mut all, now, [11.0, 0.0]) {
                     spent += 11.0;
                 }
             }
             // An input with one hand, two ticks late.
-            kept += u32::from(last.pays_for_late(&mut all, now, 4.0));
+            kept += u32::from(last.pays_for_late(&mut all, now, [4.0, 0.0]));
         }
         // Beside the first burst, two peers' worth and the shares. Each alone may spend 192 a tick.
         let most = 512.0 + 400.0 * 2.0 * 192.0 + 59.0 * 400.0 * 4.0;

@@ -299,7 +299,9 @@ impl PeerSession {
                     // What costs too much counts as lost. It is requested again, and when it has
                     // been missing for too long, a state repairs all.
                     let pays = (&mut *other, &mut self.shared);
-                    if !self.inputs.lacks(user, tick) || !affords(now, pays, &self.bodies, &input, planned) {
+                    if !self.inputs.lacks(user, tick)
+                        || !affords(now, pays, (&self.bodies, &self.inputs), &input, planned)
+                    {
                         continue;
                     }
                     if self.inputs.put(user, input) && tick <= self.tick {

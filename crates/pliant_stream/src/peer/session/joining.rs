@@ -185,16 +185,18 @@ impl PeerSession {
         let Some(mut other) = self.others.remove(&peer) else { return };
         self.gone.add_counts(&other.link.stats);
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
+        // All peers received the same last input, or extrapolate the same hands a little further.
+        // After that the hands are released.
         if let Some(inputs) = self.inputs.users.get_mut(&user) {
-            // All peers received the same last input, or extrapolate the same hands a little
-            // further. After that the hands are released.
             inputs.gone = true;
+        }
+        if let Some(inputs) = self.inputs.users.get(&user) {
             let from = inputs.highest + 1;
             let again = self.rollback_from.unwrap_or(self.tick + 1).saturating_sub(from);
             // Without a hand in its last input, nothing was extrapolated.
             if let Some(last) = inputs.newest().filter(|last| again > 0 && !last.held.is_empty()) {
                 // The user pays for the ticks as for a late input. Otherwise a state repairs all.
-                let cost = late_cost(&self.bodies, last, again);
+                let cost = late_cost((&self.bodies, &self.inputs), last, again);
                 if other.pays_for_late(&mut self.shared, self.updated, cost) {
                     self.rollback_from = Some(from);
                 } else {

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::{BodyId, PeerBody, PeerId, PeerSession, RemotePeer, SharedBudgets, Tick, WINDOW};
-use crate::wire::{Datagram, InputTick, Inputs, MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TICKS, NackRun};
+use super::{BodyId, InputLog, PeerBody, PeerId, PeerSession, RemotePeer, SharedBudgets, Tick, WINDOW};
+use crate::wire::{Datagram, HeldAt, InputTick, Inputs, MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TICKS, NackRun};
 
 /// What a tick that is stepped again with contacts costs more than one without.
 const CONTACT_COST: u64 = 4;
@@ -94,24 +94,36 @@ impl PeerSession {
 pub(super) fn affords(
     now: Duration,
     (other, all): (&mut RemotePeer, &mut SharedBudgets),
-    bodies: &BTreeMap<BodyId, PeerBody>,
+    (bodies, inputs): (&BTreeMap<BodyId, PeerBody>, &InputLog),
     input: &InputTick,
     planned: Tick,
 ) -> bool {
     let again = planned.saturating_sub(input.tick);
-    (again == 0 || other.pays_for_late(all, now, late_cost(bodies, input, again)))
+    // A hand that does not act has no patch, and goes on without paying for it again.
+    let before = other.user.and_then(|user| inputs.users.get(&user)?.newest());
+    let goes_on = |hand: &HeldAt| {
+        let key = |held: &HeldAt| (held.body, held.vertex, held.radius.to_bits());
+        before.is_some_and(|before| before.held.iter().any(|held| key(held) == key(hand)))
+    };
+    (again == 0 || other.pays_for_late(all, now, late_cost((bodies, inputs), input, again)))
         && input.held.iter().all(|held| match bodies.get(&held.body) {
-            Some(body) if !body.has_patch(held.vertex, held.radius) => {
+            Some(body) if !body.has_patch(held.vertex, held.radius) && !goes_on(held) => {
                 other.pays_for_patch(all, now, body.model(), held)
             }
             _ => true,
         })
 }
 
-/// What it costs to step a number of ticks again for an input.
-pub(super) fn late_cost(bodies: &BTreeMap<BodyId, PeerBody>, input: &InputTick, ticks: u64) -> f64 {
+/// What it costs to step a number of ticks again for an input: what its sender pays, and what the
+/// hands of all add to that.
+pub(super) fn late_cost(
+    (bodies, inputs): (&BTreeMap<BodyId, PeerBody>, &InputLog),
+    input: &InputTick,
+    ticks: u64,
+) -> [f64; 2] {
     // All bodies are stepped again, and a step with contacts takes as long as several without.
     let touches = bodies.values().any(PeerBody::touches);
     let done = input.held.len() + input.impulses.len();
-    (ticks * (1 + done as u64 + if touches { CONTACT_COST } else { 0 })) as f64
+    let own = 1 + done as u64 + if touches { CONTACT_COST } else { 0 };
+    [own, inputs.crowd()].map(|cost| (ticks * cost) as f64)
 }
