@@ -166,6 +166,17 @@ pub enum MeshError {
         /// Nearest number that a lattice reached.
         nearest: usize,
     },
+    /// So few tetrahedra cannot fill so thin a shape.
+    #[error(
+        "shape too thin for {tets} tetrahedra: expected its volume within 2 %, the best mesh is off by {:.0} %; ask for more",
+        error * 100.0
+    )]
+    TooThin {
+        /// Wanted number of tetrahedra.
+        tets: usize,
+        /// Error of the volume of the best mesh, as a fraction.
+        error: f64,
+    },
     /// A mesh that this crate made has dihedral angles outside the guaranteed range.
     #[error("dihedral angles: expected {expected:?} degrees, found {found:?}")]
     Dihedral {

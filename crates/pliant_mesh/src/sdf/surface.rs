@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use nalgebra::Vector3;
 
-use super::SignedDistance;
+use super::{Extent, SignedDistance};
 use crate::{
     MeshError, Repair, Surface,
     bvh::{Bvh, Feature},
@@ -22,6 +22,8 @@ pub struct SurfaceDistance {
     bvh: Bvh,
     bounds: [[f64; 3]; 2],
     sign: Sign,
+    /// Volume and area, if the surface is one sound part.
+    extent: Option<Extent>,
 }
 
 #[derive(Debug)]
@@ -41,7 +43,8 @@ impl SurfaceDistance {
         let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
         let sign =
             if solid.part_count() == 1 { Sign::Normals(normals(&solid, &corners)) } else { Sign::Winding };
-        Ok(Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign })
+        let extent = extent(&solid);
+        Ok(Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign, extent })
     }
 
     /// Prepares a surface that [`Surface::repaired`] can repair and returns the list of repairs.
@@ -53,7 +56,9 @@ impl SurfaceDistance {
     pub fn repaired(surface: &Surface) -> Result<(Self, Repair), MeshError> {
         let (solid, repair) = surface.repaired()?;
         let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
-        Ok((Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign: Sign::Winding }, repair))
+        let extent = solid.closed().ok().and_then(|sound| extent(&sound));
+        let bvh = Bvh::new(&corners);
+        Ok((Self { bvh, bounds: solid.bounds(), sign: Sign::Winding, extent }, repair))
     }
 
     /// Prepares a surface with [`SurfaceDistance::new`] if possible, otherwise with
@@ -107,6 +112,20 @@ impl SignedDistance for SurfaceDistance {
     fn bounds(&self) -> [[f64; 3]; 2] {
         self.bounds
     }
+
+    fn closest(&self, p: [f64; 3]) -> [f64; 3] {
+        self.bvh.closest(p.into()).point.into()
+    }
+
+    fn extent(&self) -> Option<Extent> {
+        self.extent
+    }
+}
+
+/// Returns the volume and area of a sound surface of one part. Several parts may lie in each other,
+/// where their volumes do not add up.
+fn extent(solid: &Surface) -> Option<Extent> {
+    (solid.part_count() == 1).then(|| Extent { volume: solid.volume(), area: solid.area() })
 }
 
 fn normals(solid: &Surface, corners: &[[Vector3<f64>; 3]]) -> Vec<[Vector3<f64>; 7]> {

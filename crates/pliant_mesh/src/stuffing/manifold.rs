@@ -158,18 +158,18 @@ fn shared(a: [u32; 4], b: [u32; 4]) -> usize {
 }
 
 /// Tetrahedra at each node, in one list.
-struct Around {
+pub(super) struct Around {
     start: Vec<u32>,
     tets: Vec<u32>,
 }
 
 impl Around {
-    fn of(&self, node: usize) -> &[u32] {
+    pub(super) fn of(&self, node: usize) -> &[u32] {
         &self.tets[self.start[node] as usize..self.start[node + 1] as usize]
     }
 }
 
-fn tets_around(mesh: &TetMesh) -> Around {
+pub(super) fn tets_around(mesh: &TetMesh) -> Around {
     let mut start = vec![0; mesh.nodes.len() + 1];
     for &n in mesh.tets.iter().flatten() {
         start[n as usize + 1] += 1;

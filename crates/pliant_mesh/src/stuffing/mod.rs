@@ -5,9 +5,11 @@
 //! cubic lattice covers the shape, lattice points near the surface are moved onto it, and a few
 //! stencils cut the tetrahedra that cross the surface.
 
+mod fit;
 mod lattice;
 mod manifold;
 mod stencil;
+mod thin;
 
 use std::collections::HashMap;
 
@@ -19,6 +21,12 @@ use crate::{MeshError, TetMesh, sdf::SignedDistance, tets::signed_volume};
 
 /// Bounds of all angles between two faces of a tetrahedron that [`stuff`] makes, degrees.
 pub const DIHEDRAL_BOUNDS_DEG: [f64; 2] = [10.7, 164.8];
+
+/// Bounds of the angles where the tetrahedra had to be fitted to thin parts, degrees.
+pub const FITTED_BOUNDS_DEG: [f64; 2] = [5.0, 175.0];
+
+/// Error of the volume above which the tetrahedra are fitted to the shape, as a fraction.
+pub const VOLUME_TOLERANCE: f64 = 0.02;
 
 /// Largest deviation of [`stuff`] from the wanted number of tetrahedra, as a fraction of this
 /// number.
@@ -67,14 +75,23 @@ pub enum Parts {
 ///
 /// The boundary of the mesh is a closed manifold whose nodes lie on the surface. All dihedral
 /// angles lie within [`DIHEDRAL_BOUNDS_DEG`]. Features thinner than the lattice are lost, and sharp
-/// edges are rounded by up to a cell. The same shape and options give the same mesh to the bit, for
-/// any number of threads. `progress` receives the completed fraction from 0 to 1 from time to time.
+/// edges are rounded by up to a cell.
+///
+/// Where this loses more than [`VOLUME_TOLERANCE`] of a shape whose volume is known (see
+/// [`SignedDistance::extent`]), the lattice fills the shape inflated by about half a cell instead,
+/// and the mesh is then fitted to the shape. The volume is within the tolerance, thin parts and
+/// sharp edges stay, and dihedral angles lie within [`FITTED_BOUNDS_DEG`]. Some nodes lie off the
+/// surface by a part of a cell, where going onto it would flatten a tetrahedron.
+///
+/// The same shape and options give the same mesh to the bit, for any number of threads. `progress`
+/// receives the completed fraction from 0 to 1 from time to time.
 ///
 /// # Errors
 /// Returns [`MeshError::Parameter`] when the count is 0 or too large or the shape's box is not
 /// finite, and [`MeshError::Empty`] when nothing is inside. Returns [`MeshError::TetCount`] when no
 /// lattice gives a number close enough to the wanted one, which happens for a few hundred
-/// tetrahedra. Returns [`MeshError::Dihedral`] when no position of the lattice gives good angles.
+/// tetrahedra. Returns [`MeshError::TooThin`] when so many tetrahedra cannot keep the volume of a
+/// thin shape. Returns [`MeshError::Dihedral`] when no position of the lattice gives good angles.
 /// No field that causes this error is known.
 pub fn stuff(
     sdf: &dyn SignedDistance,
@@ -94,19 +111,51 @@ pub fn stuff(
             format!("{:?} to {:?}", sdf.bounds()[0], sdf.bounds()[1]),
         ));
     }
+    thin::fill(sdf, options, progress)
+}
+
+/// How [`fill_lattice`] inflates the shape, and where it starts.
+#[derive(Clone, Copy)]
+struct Inflation {
+    /// Distance by which the shape is inflated on all sides, in cells.
+    by: f64,
+    /// Cell of the first attempt, m.
+    cell: f64,
+    /// Largest number of attempts.
+    attempts: usize,
+}
+
+/// Fills a shape, or the inflated shape, with about the wanted number of tetrahedra.
+fn fill_lattice(
+    sdf: &dyn SignedDistance,
+    options: &StuffOptions,
+    inflation: Option<Inflation>,
+    progress: &mut dyn FnMut(f32),
+) -> Result<TetMesh, MeshError> {
+    let target = options.target_tets;
+    let [low, high] = sdf.bounds().map(Vector3::from);
+    let size = high - low;
     // The first attempt uses a coarse lattice. The count is about proportional to the cell to the
     // power -3, and two counts give a better estimate of the power.
-    let mut cell = (size.product() / COARSE_CELLS.min(target as f64 / 3.0)).cbrt().min(size.max());
+    let mut cell = inflation.map_or_else(
+        || (size.product() / COARSE_CELLS.min(target as f64 / 3.0)).cbrt().min(size.max()),
+        |inflation| inflation.cell,
+    );
+    let attempts = inflation.map_or(MAX_ATTEMPTS, |inflation| inflation.attempts);
     let mut tried: Vec<(f64, usize)> = Vec::new();
     let mut nearest: Option<usize> = None;
     let mut found_angles = None;
     let mut moved = false;
-    for attempt in 0..MAX_ATTEMPTS {
+    for attempt in 0..attempts {
         progress(attempt as f32 / (attempt + 2) as f32);
         // Where symmetry makes the count jump (in steps of up to 48), another position of the
         // lattice helps.
         let shift = if attempt < SYMMETRIC_ATTEMPTS && !moved { 0.0 } else { attempt as f64 };
-        let (mesh, dropped) = mesh(sdf, cell, SHIFT.map(|s| s * shift % 1.0))?;
+        let shift = SHIFT.map(|s| s * shift % 1.0);
+        let (mesh, dropped) = match inflation {
+            Some(Inflation { by, .. }) => mesh(&thin::Inflated { sdf, by: by * cell }, cell, shift)?,
+            None => mesh(sdf, cell, shift)?,
+        };
         let mesh = keep_parts(mesh, options.parts);
         let count = mesh.tets.len();
         if count.abs_diff(target) as f64 <= COUNT_TOLERANCE * target as f64 {
@@ -117,7 +166,6 @@ pub fn stuff(
                 || quality.max_dihedral_deg > DIHEDRAL_BOUNDS_DEG[1];
             if !bad_angles && (dropped == 0 || attempt >= PATIENT_ATTEMPTS) {
                 mesh.check()?;
-                progress(1.0);
                 return Ok(mesh);
             }
             if bad_angles {

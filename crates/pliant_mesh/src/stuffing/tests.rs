@@ -1,5 +1,7 @@
+use nalgebra::Rotation3;
+
 use super::*;
-use crate::Surface;
+use crate::{Surface, sdf::SurfaceDistance, shapes};
 
 struct Ball(f64);
 
@@ -207,4 +209,138 @@ fn what_cannot_be_filled_is_refused_by_name() {
     }
     let too_few = stuff(&Torus { ring: 1.0, tube: 0.1 }, &StuffOptions::with_target(1), &mut |_| ());
     assert!(matches!(too_few, Err(MeshError::TetCount { wanted: 1, .. })), "{too_few:?}");
+}
+
+/// Returns the surface of a unit cube of these cells whose points are moved.
+fn moved_cube(cells: [usize; 3], to: impl Fn([f64; 3]) -> [f64; 3]) -> Surface {
+    let mut cube = shapes::bar(cells, [1.0; 3]).unwrap();
+    cube.nodes.iter_mut().for_each(|p| *p = to(*p));
+    cube.boundary().0
+}
+
+/// Returns a flat blade, 1 m x 0.2 m.
+fn blade(thickness: f64) -> Surface {
+    moved_cube([50, 10, 2], |[x, y, z]| [x, 0.2 * y, thickness * z])
+}
+
+/// Returns a surface that is turned against the lattice.
+fn turned(mut surface: Surface) -> Surface {
+    let turn = Rotation3::from_euler_angles(0.4, 0.5, 0.6);
+    surface.positions.iter_mut().for_each(|p| *p = (turn * Vector3::from(*p)).into());
+    surface
+}
+
+/// Returns a blade that is bent around its width and whose thickness falls from 30 to 6 mm.
+fn saber() -> Surface {
+    moved_cube([60, 12, 2], |[x, y, z]| {
+        let radius = 1.0 / 1.2 + (0.03 - 0.024 * y) * (z - 0.5);
+        [radius * (1.2 * x).sin(), 0.2 * y, radius * (1.2 * x).cos()]
+    })
+}
+
+/// Returns a cup of radius 0.1 m and height 0.2 m with walls of this thickness.
+fn cup(wall: f64) -> Surface {
+    const ROUND: u32 = 96;
+    let (radius, height) = (0.1, 0.2);
+    let share = |n: i32, of: i32| f64::from(n) / f64::from(of);
+    let mut profile: Vec<[f64; 2]> = (1..=16).map(|n| [radius * share(n, 16), 0.0]).collect();
+    profile.extend((1..=24).map(|n| [radius, height * share(n, 24)]));
+    profile.extend((0..=24).rev().map(|n| [radius - wall, wall + (height - wall) * share(n, 24)]));
+    profile.extend((1..16).rev().map(|n| [(radius - wall) * share(n, 16), wall]));
+    let mut cup = Surface { positions: vec![[0.0; 3], [0.0, wall, 0.0]], ..Surface::default() };
+    for [r, y] in &profile {
+        cup.positions.extend((0..ROUND).map(|k| {
+            let angle = std::f64::consts::TAU * f64::from(k) / f64::from(ROUND);
+            [r * angle.cos(), *y, r * angle.sin()]
+        }));
+    }
+    let vertex = |ring: u32, k: u32| 2 + ring * ROUND + k % ROUND;
+    let last = profile.len() as u32 - 1;
+    for k in 0..ROUND {
+        cup.triangles
+            .extend([[0, vertex(0, k), vertex(0, k + 1)], [vertex(last, k), 1, vertex(last, k + 1)]]);
+        for ring in 0..last {
+            let [a, b] = [vertex(ring, k), vertex(ring, k + 1)];
+            let [c, d] = [vertex(ring + 1, k), vertex(ring + 1, k + 1)];
+            cup.triangles.extend([[a, c, d], [a, d, b]]);
+        }
+    }
+    cup.closed().unwrap()
+}
+
+/// Returns the volume between the boundary of a mesh and the surface, m^3: the distance of each
+/// triangle's center times its area.
+fn gap(boundary: &Surface, sdf: &dyn SignedDistance) -> f64 {
+    let of = |[a, b, c]: [Vector3<f64>; 3]| {
+        sdf.distance(((a + b + c) / 3.0).into()).abs() * 0.5 * (b - a).cross(&(c - a)).norm()
+    };
+    boundary.corners().map(of).sum()
+}
+
+/// Fills a thin surface and checks what `stuff` promises for it.
+fn filled_thin(name: &str, surface: &Surface, target: usize) -> TetMesh {
+    let sdf = SurfaceDistance::new(surface).unwrap();
+    let start = std::time::Instant::now();
+    let mesh = stuffed(&sdf, target);
+    let seconds = start.elapsed().as_secs_f64();
+    let lost = 1.0 - mesh.volume() / surface.volume();
+    let quality = mesh.quality();
+    // The rows of docs/measurements.md.
+    println!(
+        "{name}: lost {:.2} %, between {:.1} %, {:.1} to {:.1} degrees, {seconds:.1} s",
+        100.0 * lost,
+        100.0 * gap(&mesh.boundary().0, &sdf) / surface.volume(),
+        quality.min_dihedral_deg,
+        quality.max_dihedral_deg,
+    );
+    assert!(lost.abs() <= VOLUME_TOLERANCE, "{name} loses {:.1} % of its volume", 100.0 * lost);
+    let count = mesh.tets.len();
+    assert!(count.abs_diff(target) as f64 <= COUNT_TOLERANCE * target as f64, "{name}: {count}");
+    let (boundary, _) = mesh.boundary();
+    boundary.check_edges().unwrap();
+    assert_eq!(boundary.part_count(), 1, "{name}");
+    assert_eq!(boundary.euler_characteristic(), 2, "{name} has holes");
+    assert!(quality.min_dihedral_deg >= FITTED_BOUNDS_DEG[0] - 1e-9, "{name}: {quality:?}");
+    assert!(quality.max_dihedral_deg <= FITTED_BOUNDS_DEG[1] + 1e-9, "{name}: {quality:?}");
+    mesh
+}
+
+#[test]
+fn thin_parts_keep_their_volume_in_one_piece() {
+    for thickness in [0.04, 0.02, 0.01, 0.005] {
+        filled_thin(&format!("blade of {thickness} m"), &blade(thickness), 8000);
+    }
+    filled_thin("turned blade of 0.02 m", &turned(blade(0.02)), 8000);
+    filled_thin("saber", &saber(), 8000);
+    filled_thin("cup of 8 mm", &cup(0.008), 8000);
+}
+
+#[test]
+fn the_boundary_of_a_fitted_mesh_is_the_surface() {
+    for (name, surface, bound) in
+        [("blade", blade(0.02), 0.02), ("saber", saber(), 0.05), ("cup", cup(0.008), 0.05)]
+    {
+        let sdf = SurfaceDistance::new(&surface).unwrap();
+        let (boundary, _) = filled_thin(name, &surface, 8000).boundary();
+        let between = gap(&boundary, &sdf);
+        assert!(between < bound * surface.volume(), "{name}: {}", between / surface.volume());
+    }
+}
+
+#[test]
+fn fitting_does_not_depend_on_the_number_of_threads() {
+    let sdf = SurfaceDistance::new(&saber()).unwrap();
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| stuffed(&sdf, 2000))
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn what_is_far_too_thin_for_its_tetrahedra_is_refused_with_its_loss() {
+    let sdf = SurfaceDistance::new(&blade(1e-4)).unwrap();
+    let refused = stuff(&sdf, &StuffOptions::with_target(1000), &mut |_| ());
+    let Err(MeshError::TooThin { tets: 1000, error }) = refused else { panic!("{refused:?}") };
+    assert!(error > VOLUME_TOLERANCE);
 }
