@@ -92,15 +92,20 @@ impl Surface {
 
     /// Returns the number of pieces that have no vertex in common.
     pub(crate) fn part_count(&self) -> usize {
+        let mut roots = self.parts();
+        roots.sort_unstable();
+        roots.dedup();
+        roots.len()
+    }
+
+    /// Returns a number for the piece of each triangle; pieces have no vertex in common.
+    pub(crate) fn parts(&self) -> Vec<u32> {
         let mut parts = Connected::new(self.positions.len());
         for t in &self.triangles {
             parts.join(t[0], t[1]);
             parts.join(t[0], t[2]);
         }
-        let mut roots: Vec<u32> = self.triangles.iter().map(|t| parts.of(t[0])).collect();
-        roots.sort_unstable();
-        roots.dedup();
-        roots.len()
+        self.triangles.iter().map(|t| parts.of(t[0])).collect()
     }
 
     pub(crate) fn corners(&self) -> impl Iterator<Item = [Vector3<f64>; 3]> + '_ {

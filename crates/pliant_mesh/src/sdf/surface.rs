@@ -22,7 +22,7 @@ pub struct SurfaceDistance {
     bvh: Bvh,
     bounds: [[f64; 3]; 2],
     sign: Sign,
-    /// Volume and area, if the surface is one sound part.
+    /// Volume and area, if the surface is one sound solid.
     extent: Option<Extent>,
 }
 
@@ -43,8 +43,9 @@ impl SurfaceDistance {
         let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
         let sign =
             if solid.part_count() == 1 { Sign::Normals(normals(&solid, &corners)) } else { Sign::Winding };
-        let extent = extent(&solid);
-        Ok(Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign, extent })
+        let bvh = Bvh::new(&corners);
+        let extent = extent(&solid, &bvh);
+        Ok(Self { bvh, bounds: solid.bounds(), sign, extent })
     }
 
     /// Prepares a surface that [`Surface::repaired`] can repair and returns the list of repairs.
@@ -56,8 +57,8 @@ impl SurfaceDistance {
     pub fn repaired(surface: &Surface) -> Result<(Self, Repair), MeshError> {
         let (solid, repair) = surface.repaired()?;
         let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
-        let extent = solid.closed().ok().and_then(|sound| extent(&sound));
         let bvh = Bvh::new(&corners);
+        let extent = solid.closed().ok().and_then(|sound| extent(&sound, &bvh));
         Ok((Self { bvh, bounds: solid.bounds(), sign: Sign::Winding, extent }, repair))
     }
 
@@ -122,10 +123,43 @@ impl SignedDistance for SurfaceDistance {
     }
 }
 
-/// Returns the volume and area of a sound surface of one part. Several parts may lie in each other,
-/// where their volumes do not add up.
-fn extent(solid: &Surface) -> Option<Extent> {
-    (solid.part_count() == 1).then(|| Extent { volume: solid.volume(), area: solid.area() })
+/// Returns the volume and area of a sound surface that is one solid, which may have cavities.
+///
+/// Several solids may lie in each other, where their volumes do not add up.
+fn extent(solid: &Surface, bvh: &Bvh) -> Option<Extent> {
+    let origin = solid.positions.first().copied().map_or_else(Vector3::zeros, Vector3::from);
+    let mut parts: HashMap<u32, Part> = HashMap::new();
+    for (corners, part) in solid.corners().zip(solid.parts()) {
+        let [a, b, c] = corners;
+        let part = parts.entry(part).or_insert(Part { volume: 0.0, doubled: 0.0, widest: corners });
+        part.volume += (a - origin).cross(&(b - origin)).dot(&(c - origin)) / 6.0;
+        let doubled = (b - a).cross(&(c - a)).norm();
+        if doubled > part.doubled {
+            (part.doubled, part.widest) = (doubled, corners);
+        }
+    }
+    let solids = parts.values().filter(|part| part.volume > 0.0).count();
+    let sound = parts.len() == 1 || (solids == 1 && parts.values().all(|part| part.bounds_solid(bvh)));
+    sound.then(|| Extent { volume: solid.volume(), area: solid.area() })
+}
+
+/// Piece of a surface: the outside of a solid, or a cavity, which has a negative volume.
+struct Part {
+    volume: f64,
+    /// Twice the area of the widest triangle, m^2, and its corners.
+    doubled: f64,
+    widest: [Vector3<f64>; 3],
+}
+
+impl Part {
+    /// Returns whether the solid lies on the inner side of the widest triangle, and nothing on the
+    /// other one. Pieces do not cross, so this says the same of all other triangles.
+    fn bounds_solid(&self, bvh: &Bvh) -> bool {
+        let [a, b, c] = self.widest;
+        let off = (b - a).cross(&(c - a)) * (1e-6 / self.doubled.sqrt());
+        let winding = |side: f64| bvh.winding_number((a + b + c) / 3.0 + off * side);
+        (winding(-1.0) - 1.0).abs() < 0.25 && winding(1.0).abs() < 0.25
+    }
 }
 
 fn normals(solid: &Surface, corners: &[[Vector3<f64>; 3]]) -> Vec<[Vector3<f64>; 7]> {
@@ -198,6 +232,9 @@ mod tests {
                 if inwards { [a, c, b] } else { [a, b, c] }
             }));
             let sdf = SurfaceDistance::new(&both).unwrap();
+            // Of a hollow the volume is known, of a ball within a ball it is not.
+            let right = |e: Extent| (e.volume / both.volume() - 1.0).abs() < 1e-12;
+            assert_eq!(sdf.extent().map(right), inwards.then_some(true));
             assert_eq!(sdf.distance([0.0, 0.1, 0.0]).signum(), distance);
             assert!(sdf.distance([0.0, 0.7, 0.0]) < 0.0);
             assert!(sdf.distance([0.0, 1.7, 0.0]) > 0.0);

@@ -110,8 +110,8 @@ impl<'a> Fit<'a> {
                 }
             }
         }
-        for n in 0..ways.len() {
-            self.go(n, self.nodes[n] + ways[n]);
+        for (n, way) in ways.into_iter().enumerate() {
+            self.go(n, self.nodes[n] + way);
         }
     }
 
