@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig};
 use pliant_stream::wire::PeerMessage;
-use pliant_stream::{BodyId, Channel, PeerId, StepSettings, StreamError, UserId};
+use pliant_stream::{BodyId, Channel, DisconnectReason, PeerId, StepSettings, StreamError, UserId};
 use support::bar;
 
 const S: Duration = Duration::from_secs(1);
@@ -20,11 +20,12 @@ fn peer(user: u16) -> PeerSession {
     peer
 }
 
-/// Brings the messages of one peer to another, and returns how many tell of others.
+/// Brings the messages of one peer to another, and returns how many tell of others. Those for
+/// connections from 10 on are for somebody else.
 fn tell(now: Duration, from: &mut PeerSession, to: &mut PeerSession, name: PeerId) -> usize {
     let mut lists = 0;
     while let Some(output) = from.poll_output() {
-        if output.channel == Channel::Message {
+        if output.channel == Channel::Message && output.peer.0 < 10 {
             lists +=
                 usize::from(matches!(PeerMessage::decode(&output.bytes), Ok(PeerMessage::Others { .. })));
             to.on_message(now, name, &output.bytes);
@@ -73,6 +74,50 @@ fn a_peer_is_told_of_those_that_it_lacks_and_no_more_often_than_they_come() {
     let told = introduced(&mut second);
     assert_eq!(told.len(), 1, "the first list has nobody whom the second lacks: {told:?}");
     assert_eq!(told[0], [name(3), name(4)]);
+}
+
+#[test]
+fn who_has_left_and_comes_back_is_told_of_again_under_the_same_list() {
+    let (mut first, mut second, mut third) = (peer(1), peer(2), peer(3));
+    let (one, two) = (PeerId(1), PeerId(2));
+    first.connect(Duration::ZERO, two, None, 1200).unwrap();
+    second.accept(Duration::ZERO, one, 1200).unwrap();
+    for _ in 0..2 {
+        tell(Duration::ZERO, &mut first, &mut second, one);
+        tell(Duration::ZERO, &mut second, &mut first, two);
+    }
+    let list = [2, 3].map(|user| (UserId(user), String::new()));
+    let mut lists = Vec::new();
+    for round in 1..5_u64 {
+        let now = 21 * S / 10 * round as u32;
+        // The third is there anew each time, under another connection.
+        let three = PeerId(10 + round);
+        first.connect(now, three, None, 1200).unwrap();
+        third.accept(now, one, 1200).unwrap();
+        for _ in 0..2 {
+            while let Some(output) = first.poll_output() {
+                if output.channel == Channel::Message && output.peer == three {
+                    third.on_message(now, one, &output.bytes);
+                }
+            }
+            while let Some(output) = third.poll_output() {
+                if output.channel == Channel::Message {
+                    first.on_message(now, three, &output.bytes);
+                }
+            }
+        }
+        assert_eq!(first.user_of(three), Some(UserId(3)));
+        // The app hears of the end and of the beginning in one look, and its list is as before.
+        first.introduce(&list).unwrap();
+        first.update(now);
+        second.update(now);
+        lists.push(tell(now, &mut first, &mut second, one));
+        tell(now, &mut second, &mut first, two);
+        first.disconnect(three, DisconnectReason::Lost);
+        third.disconnect(one, DisconnectReason::Lost);
+        third.introduce(&[]).unwrap();
+    }
+    assert_eq!(lists, [1; 4], "each time it comes, the second is told");
 }
 
 #[test]

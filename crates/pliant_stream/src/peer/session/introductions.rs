@@ -24,10 +24,18 @@ pub(super) struct Introductions {
     next: Duration,
 }
 
+impl Introductions {
+    /// Takes somebody who has left off the list. Of whoever comes back all are told again, also
+    /// where the app learns of both in one look and its list stays the same.
+    pub(super) fn forget(&mut self, user: UserId) {
+        self.list.retain(|(known, _)| *known != user.0);
+    }
+}
+
 impl PeerSession {
     /// Sets with whom this peer is connected, as user numbers and addresses, at most 64. When
-    /// somebody has come, all peers in the session are told, at most every two seconds. Those who
-    /// have lost one of them get [`PeerEvent::Introduced`].
+    /// somebody has come, or come back, all peers in the session are told, at most every two
+    /// seconds. Those who have lost one of them get [`PeerEvent::Introduced`].
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for an address of more than 512 bytes.

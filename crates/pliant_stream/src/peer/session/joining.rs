@@ -205,6 +205,7 @@ impl PeerSession {
             }
             self.inputs.forget_gone(self.tick);
         }
+        self.introductions.forget(user);
         self.away.keep(user, other.budgets);
         self.event(PeerEvent::Left { user, reason });
     }
