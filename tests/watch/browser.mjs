@@ -68,12 +68,12 @@ export class Browser {
   send(method, params = {}, sessionId = this.#session) {
     const id = this.#next++;
     const answer = new Promise((...both) => this.#waiting.set(id, both));
-    this.child.stdio[3].write(`${JSON.stringify({ id, method, params, sessionId })}\0`);
+    this.child.stdio[3].write(`${JSON.stringify({ id, method, params, ...(sessionId && { sessionId }) })}\0`);
     return answer;
   }
   async open(url) {
-    const { targetId } = await this.send("Target.createTarget", { url: "about:blank" }, undefined);
-    const attached = await this.send("Target.attachToTarget", { targetId, flatten: true }, undefined);
+    const { targetId } = await this.send("Target.createTarget", { url: "about:blank" }, null);
+    const attached = await this.send("Target.attachToTarget", { targetId, flatten: true }, null);
     this.#session = attached.sessionId;
     await this.send("Page.enable");
     await this.send("Runtime.enable");
@@ -101,9 +101,12 @@ export class Browser {
 export async function until(browser, what, so) {
   const began = performance.now();
   while (performance.now() - began < LONGEST) {
-    if (await so().catch(() => false)) return (performance.now() - began) / 1000;
+    // A browser that does not answer is no answer.
+    const late = sleep(LONGEST).then(() => false);
+    if (await Promise.race([so().catch(() => false), late])) return (performance.now() - began) / 1000;
     await sleep(20);
   }
-  throw new Error(`${what}: not after ${LONGEST / 1000} s: ${await browser.state()}`);
+  const state = await Promise.race([browser.state(), sleep(3000).then(() => "the page does not answer")]);
+  throw new Error(`${what}: not after ${LONGEST / 1000} s: ${state}`);
 }
 

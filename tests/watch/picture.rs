@@ -101,6 +101,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         app.update();
     }
     let file = PathBuf::from(out);
+    if file.exists() {
+        std::fs::remove_file(&file)?;
+    }
     app.world_mut().spawn(Screenshot::image(canvas)).observe(save_to_disk(file.clone()));
     let began = Instant::now();
     while !file.exists() {

@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import { execFileSync, spawnSync } from "node:child_process";
 import { createHash } from "node:crypto";
 import { createWriteStream, existsSync } from "node:fs";
+import { createServer as createHttpServer } from "node:http";
 import { createServer as listen } from "node:net";
 import { join } from "node:path";
 import { Browser, serve, sleep, start, until } from "./browser.mjs";
@@ -34,11 +35,29 @@ execFileSync("openssl", [...request, ...about], { stdio: "ignore" });
 const der = execFileSync("openssl", ["x509", "-in", certificate, "-outform", "der"]);
 const hash = createHash("sha256").update(der).digest("hex");
 
+// Who may do what: the relay asks once for each connection. Only the host's token may publish; who
+// has none may watch.
+const asked = { host: 0, watcher: 0, refused: 0 };
+const auth = createHttpServer((request, answer) => {
+  let text = "";
+  request.on("data", (data) => (text += data));
+  request.on("end", () => {
+    const { event, query } = JSON.parse(text);
+    if (event !== "connect") return answer.writeHead(200).end("{}");
+    const who = query === "jwt=of-the-host" ? "host" : query ? "refused" : "watcher";
+    asked[who]++;
+    const grant = who === "host" ? { publish: ["tests/**"] } : { subscribe: ["tests/**"] };
+    if (who === "refused") answer.writeHead(403).end();
+    else answer.writeHead(200, { "content-type": "application/json" }).end(JSON.stringify(grant));
+  });
+});
+await new Promise((done) => auth.listen(0, "127.0.0.1", done));
+
 const port = await freePort();
 const relayAddress = `https://127.0.0.1:${port}/`;
 function startRelay() {
   const where = ["--listen", `127.0.0.1:${port}`, "--listen-tls-cert", certificate, "--listen-tls-key", key];
-  const relay = start(RELAY, [...where, "--auth-public", "**"], { stdio: ["ignore", "pipe", "pipe"] });
+  const relay = start(RELAY, [...where, "--auth-url", `http://127.0.0.1:${auth.address().port}/`], { stdio: ["ignore", "pipe", "pipe"] });
   const log = createWriteStream(join(WORK, "relay.log"), { flags: "a" });
   relay.stdout.pipe(log, { end: false });
   relay.stderr.pipe(log, { end: false });
@@ -51,7 +70,8 @@ function startHost() {
   const host = start(
     join(BIN, "examples/dedicated_server"),
     ["--bind", "127.0.0.1:0", "--hz", `${HZ}`, "--body", body, "--play", "--trace", trace].concat(
-      ["--publish", relayAddress, "--certificate", hash, "--page", pageAddress, "--session", "tests/body"],
+      ["--publish", `${relayAddress}?jwt=of-the-host`, "--link-relay", relayAddress],
+      ["--certificate", hash, "--page", pageAddress, "--session", "tests/body"],
     ),
     { stdio: ["ignore", "pipe", "inherit"] },
   );
@@ -67,11 +87,22 @@ function startHost() {
   return { host, link };
 }
 
-const told = {};
+// Each number is printed as soon as it is known.
+const told = new Proxy(
+  {},
+  {
+    set(numbers, name, value) {
+      console.log(`${name}: ${value}`);
+      numbers[name] = value;
+      return true;
+    },
+  },
+);
 let relay = startRelay();
 let { host, link } = startHost();
 const address = await link;
 assert.ok(address.startsWith(pageAddress) && address.includes(hash), address);
+assert.ok(!address.includes("of-the-host"), "the host's token is not in the link");
 const browser = new Browser(CHROMIUM, join(WORK, "profile"));
 await browser.open(address);
 await until(browser, "the first picture", () => browser.value("pliant.numbers.firstPicture > 0"));
@@ -128,10 +159,23 @@ assert.equal(told.wrong, 0, await browser.value("document.getElementById('status
 assert.ok(told.moved > 0.02, `the body moves by ${told.moved} of its size`);
 assert.ok(told.rms < 1e-4 && told.largest < 1e-3, JSON.stringify(told));
 
-/** Whether frames go on: more than a few since the call. */
+/**
+ * Waits until frames go on for two seconds without a gap of half a second, and returns when that
+ * began, s after the call: what waited in a relay that stood still does not count.
+ */
 async function goesOn(what) {
-  const before = await browser.value("pliant.numbers.frames");
-  return until(browser, what, async () => (await browser.value("pliant.numbers.frames")) > before + 3);
+  const began = performance.now();
+  let [frames, since, last] = [await browser.value("pliant.numbers.frames"), undefined, began];
+  await until(browser, what, async () => {
+    const [found, now] = [await browser.value("pliant.numbers.frames"), performance.now()];
+    if (now - last > 500) since = undefined;
+    if (found > frames) {
+      since ??= now;
+      [frames, last] = [found, now];
+    }
+    return since !== undefined && now - since > 2000;
+  });
+  return (since - began) / 1000;
 }
 
 // The line is cut for 10 s: the relay stands still.
@@ -155,5 +199,12 @@ host.kill("SIGTERM");
 await until(browser, "the page without a host", async () =>
   (await browser.value("document.getElementById('status').textContent")).includes("waiting for the host"),
 );
-console.log(JSON.stringify(told, null, 1));
+assert.ok(asked.host >= 3 && asked.watcher >= 2 && asked.refused === 0, JSON.stringify(asked));
+
+// Whoever has another token does not get in.
+await browser.open(address.replace(encodeURIComponent(relayAddress), encodeURIComponent(`${relayAddress}?jwt=no`)));
+await until(browser, "a refusal", async () => asked.refused > 0);
+await sleep(1000);
+assert.equal(await browser.value("pliant.numbers.frames"), 0);
+console.log("all is well");
 process.exit(0);

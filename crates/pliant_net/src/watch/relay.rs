@@ -89,9 +89,9 @@ impl RelayOptions {
     pub(super) fn link(&self, page: &str, relay: &str) -> String {
         let mut fragment = url::form_urlencoded::Serializer::new(String::new());
         fragment.append_pair("relay", relay).append_pair("session", &self.session);
-        // Another relay has another certificate.
+        // Another relay has another certificate; the same one may be there with another token.
         if let RelayTrust::Certificates(hashes) = &self.trust
-            && relay == self.relay
+            && without_token(relay) == without_token(&self.relay)
         {
             for hash in hashes {
                 let hex: String = hash.iter().map(|byte| format!("{byte:02x}")).collect();
