@@ -30,8 +30,8 @@ pub struct HostSessionConfig {
     /// Largest rate of datagrams to one guest, bit/s.
     ///
     /// Beyond this rate, or when a guest's round trip grows by 50 ms over its minimum, the guest
-    /// gets fewer repeats, then fewer refreshes, then fewer modes. No tick is dropped. Default: 1
-    /// Mbit/s.
+    /// gets fewer repeats, then fewer refreshes, and of a stream of accelerations then fewer modes.
+    /// No tick is dropped. Default: 1 Mbit/s.
     pub guest_rate: f64,
     /// Delay of the answers to NACKs, to reproduce the figures of the paper. Default: 0, answers
     /// are sent at once.

@@ -73,7 +73,12 @@ impl Regulator {
         self.level
     }
 
-    /// Reduces a subscription to the present level: first repeats, then refreshes, then modes.
+    /// Reduces a subscription to the present level: first repeats, then refreshes, then the modes
+    /// of a stream of accelerations.
+    ///
+    /// A stream of reactions keeps all modes. They cost nothing but their refreshes, and a receiver
+    /// of fewer has another body: with reduced elasticity one that hardly bends, because the
+    /// coordinates that shorten it are missing.
     pub(crate) fn cut(&self, mut subscription: StreamSubscription, model_modes: usize) -> StreamSubscription {
         if self.level >= 1 {
             subscription.repeats = subscription.repeats.min(1);
@@ -85,12 +90,35 @@ impl Regulator {
             subscription.refresh = subscription.refresh.saturating_mul(2);
         }
         if self.level >= 4 {
-            let modes = usize::from(subscription.modes).min(model_modes) >> (self.level - 3);
-            subscription.modes = modes.max(8).min(usize::from(subscription.modes)) as u16;
             if subscription.payload == Payload::Forces {
-                subscription.refresh = subscription.refresh.saturating_mul(2);
+                subscription.refresh = subscription.refresh.saturating_mul(2 << (self.level - 3));
+            } else {
+                let modes = usize::from(subscription.modes).min(model_modes) >> (self.level - 3);
+                subscription.modes = modes.max(8).min(usize::from(subscription.modes)) as u16;
             }
         }
         subscription
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::AccelerationCoding;
+
+    #[test]
+    fn the_last_level_takes_modes_from_accelerations_only() {
+        let regulator = Regulator { level: LAST, ..Regulator::default() };
+        for (payload, modes) in
+            [(Payload::Forces, 40), (Payload::Accelerations(AccelerationCoding::Visible), 8)]
+        {
+            let whole = StreamSubscription { payload, modes: 40, repeats: 3, refresh: 15 };
+            assert_eq!(Regulator::default().cut(whole, 40), whole);
+            let cut = regulator.cut(whole, 40);
+            assert_eq!((cut.modes, cut.repeats), (modes, 0));
+            // What is refreshed with each frame is at most an eighth of what it was.
+            let refreshed = |of: StreamSubscription| f64::from(of.modes) / f64::from(of.refresh);
+            assert!(refreshed(cut) <= refreshed(whole) / 8.0, "{cut:?}");
+        }
     }
 }
