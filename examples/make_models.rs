@@ -34,6 +34,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     jelly_texture().try_into_dynamic()?.save(folder.join("jelly.png"))?;
 
     let held = vec!["y<0.004".parse()?];
+    // Small files for examples of crowds and of modes. Of the material of large strains they have
+    // none.
     let jelly = BakeConfig {
         modes: 20,
         poisson: 0.45,
@@ -41,7 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         damping: Damping::Ratio(0.05),
         anchors: held.clone(),
         sites: Some(64),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let soft = BakeConfig { name: "soft jelly".into(), young: 4e3, ..jelly.clone() };
     let firm = BakeConfig { name: "firm jelly".into(), young: 4e4, ..jelly };
@@ -57,7 +59,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         damping: Damping::Ratio(0.06),
         anchors: held,
         sites: Some(32),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     make(&assets.join("bud.ron"), 2_000, false, &bud, &folder.join("bud.modal"))?;
     let jack = BakeConfig {
@@ -67,7 +69,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         density: 400.0,
         damping: Damping::Ratio(0.04),
         sites: Some(64),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     make(&assets.join("jack.ron"), 6_000, false, &jack, &folder.join("jack.modal"))
 }

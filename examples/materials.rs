@@ -133,7 +133,6 @@ fn baked(young: f64) -> BakeRequest {
         skin: BakeSkin::Shape,
         config: BakeConfig {
             name: "jelly".into(),
-            modes: 20,
             young,
             poisson: 0.45,
             damping: Damping::Ratio(0.05),

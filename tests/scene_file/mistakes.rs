@@ -168,6 +168,29 @@ fn numbers_out_of_their_range_are_told_where_they_are() {
     }
 }
 
+/// The defaults of a scene are those of a bake, also where the feature is off.
+#[cfg(feature = "bake")]
+#[test]
+fn a_bake_of_a_scene_has_the_defaults_of_a_bake_and_refuses_what_its_material_does_not_bear() {
+    let baked = |rest: &str| {
+        let bake = format!("bake: (shape: \"pip.obj\"{rest})");
+        SceneFile::from_ron(&GOOD.replacen("model: \"pip.modal\"", &bake, 1), "my.ron")
+    };
+    let scene = baked("").unwrap();
+    let (got, wanted) = (scene.scene().bodies[0].bake.clone().unwrap(), pliant::bake::BakeConfig::default());
+    assert_eq!((got.modes, got.material), (wanted.modes, wanted.material_name()));
+    assert_eq!((got.young, got.poisson, got.density), (wanted.young, wanted.poisson, wanted.density));
+    for (rest, told) in [
+        (", material: \"rubber\"", "`neo-hookean`, `st-venant-kirchhoff` or `linear`"),
+        (", poisson: 0.49", "a Poisson ratio from -0.99 to 0.45"),
+        (", modes: 121", "modes from 1 to 120"),
+    ] {
+        let error = baked(rest).unwrap_err();
+        assert!(error.to_string().contains(told), "{error}");
+    }
+    assert!(baked(", material: \"linear\", poisson: 0.49, modes: 121").is_ok());
+}
+
 /// A game without the feature has no mesh crate, so that a scene has the rules of paths once more.
 #[cfg(feature = "bake")]
 #[test]

@@ -16,7 +16,7 @@ const GRAVITY: f64 = 9.81;
 /// A free block of 60 coordinates, with `cells` hexahedra along each edge of 25 mm.
 fn block(cells: [usize; 3]) -> Arc<ModalModel> {
     let mesh = shapes::bar(cells, cells.map(|count| 0.025 * count as f64)).unwrap();
-    let config = BakeConfig { modes: 54, young: 1e5, sites: Some(100), ..BakeConfig::default() };
+    let config = BakeConfig { modes: 54, young: 1e5, sites: Some(100), ..BakeConfig::linear() };
     Arc::new(bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model)
 }
 

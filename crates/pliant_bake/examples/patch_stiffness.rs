@@ -61,7 +61,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let element = if argument(2) == Some("tet4") { Element::Tet4 } else { Element::Tet10 };
     let modes = argument(3).map_or(Ok(60), str::parse)?;
-    let config = BakeConfig { element, modes, anchors: vec![anchor.parse()?], ..BakeConfig::default() };
+    let config = BakeConfig { element, modes, anchors: vec![anchor.parse()?], ..BakeConfig::linear() };
     let begun = Instant::now();
     let made = bake(&mesh, None, &config, &mut |_, _| ())?;
     let model = made.model;

@@ -337,7 +337,7 @@ mod tests {
             sites: Some(4),
             element: Element::Tet4,
             anchors: vec!["x<0.001".parse().unwrap()],
-            ..Default::default()
+            ..BakeConfig::linear()
         }
     }
 

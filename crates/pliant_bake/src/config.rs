@@ -20,9 +20,10 @@ pub struct BakeConfig {
     /// Finite element. Default: [`Element::Tet10`].
     pub element: Element,
     /// Number of elastic modes to keep, or of all coordinates with a [`material`](Self::material).
-    /// Default: 60.
+    /// Default: [`BakeConfig::COORDINATES`], and [`BakeConfig::MODES`] for [`BakeConfig::linear`].
     pub modes: usize,
-    /// Material for large strains. Default: `None`, linear elasticity only.
+    /// Material for large strains, or `None` for linear elasticity only. Default: the stable
+    /// neo-Hookean law. [`BakeConfig::linear`] has none.
     ///
     /// With a material the coordinates are the lowest modes (about a third of them) and the most
     /// important combinations of their derivatives, and the model has a reduced elastic energy
@@ -70,8 +71,8 @@ impl Default for BakeConfig {
         Self {
             name: String::new(),
             element: Element::Tet10,
-            modes: 60,
-            material: None,
+            modes: Self::COORDINATES,
+            material: Some(Material::default()),
             young: 1e5,
             poisson: 0.4,
             density: 1000.0,
@@ -86,13 +87,53 @@ impl Default for BakeConfig {
     }
 }
 
+/// Error for a text that names no material.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("material `{text}`: expected neo-hookean, st-venant-kirchhoff or linear")]
+pub struct MaterialSyntax {
+    /// Received text, at most 80 characters of it.
+    pub text: String,
+}
+
 impl BakeConfig {
     /// Number of coordinates that suits a model with a [`material`](Self::material): a step of such
     /// a body takes about a tenth of a millisecond.
     pub const COORDINATES: usize = 36;
 
+    /// Number of modes that suits a model without a [`material`](Self::material).
+    pub const MODES: usize = 60;
+
     /// Maximum number of coordinates of a model with a [`material`](Self::material).
     pub const MAX_COORDINATES: usize = 120;
+
+    /// Returns the default with linear elasticity only: without a [`material`](Self::material), and
+    /// with [`BakeConfig::MODES`] modes.
+    ///
+    /// Such a body has a smaller file and a cheaper step, for crowds and for bodies that hands do
+    /// not lead far. Its forces are those of small strains.
+    pub fn linear() -> Self {
+        Self { modes: Self::MODES, material: None, ..Self::default() }
+    }
+
+    /// Returns the default with the material of this name: `neo-hookean`, `st-venant-kirchhoff`, or
+    /// `linear` for [`BakeConfig::linear`].
+    ///
+    /// # Errors
+    /// Returns [`MaterialSyntax`] for every other text.
+    pub fn of_material(name: &str) -> Result<Self, MaterialSyntax> {
+        let of = |material| Self { material: Some(material), ..Self::default() };
+        match name {
+            "linear" => Ok(Self::linear()),
+            "neo-hookean" => Ok(of(Material::NeoHookean)),
+            "st-venant-kirchhoff" => Ok(of(Material::StVenantKirchhoff)),
+            _ => Err(MaterialSyntax { text: name.chars().take(80).collect() }),
+        }
+    }
+
+    /// Returns the name of the material, as [`BakeConfig::of_material`] takes it.
+    pub fn material_name(&self) -> String {
+        self.material.map_or_else(|| "linear".to_owned(), |material| material.to_string())
+    }
 
     /// Returns whether nothing fixes the body: neither an anchor nor a painting.
     pub fn is_free(&self) -> bool {
@@ -125,9 +166,14 @@ impl BakeConfig {
             nu,
         )?;
         let sound = self.material.is_none() || self.modes <= Self::MAX_COORDINATES;
-        number("modes", "at most 120 coordinates with a material", sound, self.modes as f64)?;
+        number(
+            "modes",
+            "at most 120 coordinates with a material other than linear",
+            sound,
+            self.modes as f64,
+        )?;
         let sound = self.material.is_none() || nu <= 0.45;
-        number("Poisson ratio", "at most 0.45 with a material for large strains", sound, nu)?;
+        number("Poisson ratio", "at most 0.45 with a material other than linear", sound, nu)?;
         number("density", "1e-6 to 1e7 kg/m^3", (1e-6..=1e7).contains(&self.density), self.density)?;
         match self.damping {
             Damping::Rayleigh { alpha, beta } => {
@@ -238,7 +284,7 @@ mod tests {
                     density,
                     damping,
                     anchors,
-                    ..BakeConfig::default()
+                    ..BakeConfig::linear()
                 };
                 let case = format!("{config:?}");
                 let made = bake(&mesh, None, &config, &mut |_, _| ());

@@ -327,7 +327,7 @@ mod tests {
     #[test]
     fn every_way_gives_the_same_compliances() {
         let mesh = shapes::bar([8, 4, 4], [1.0, 0.4, 0.4]).unwrap();
-        let config = BakeConfig { anchors: vec!["x<0.001".parse().unwrap()], ..Default::default() };
+        let config = BakeConfig { anchors: vec!["x<0.001".parse().unwrap()], ..BakeConfig::linear() };
         let fe = FeMesh::new(&mesh, Element::Tet10);
         let graph = fe.graph(false);
         let held = support::anchored_nodes(&fe, &config).unwrap();

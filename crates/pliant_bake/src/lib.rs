@@ -22,7 +22,7 @@
 //! use pliant_bake::{BakeConfig, bake};
 //!
 //! let mesh = pliant_mesh::shapes::bar([10, 2, 2], [1.0, 0.2, 0.2])?;
-//! let config = BakeConfig { modes: 6, anchors: vec!["x<0.001".parse()?], ..BakeConfig::default() };
+//! let config = BakeConfig { modes: 6, anchors: vec!["x<0.001".parse()?], ..BakeConfig::linear() };
 //! let baked = bake(&mesh, None, &config, &mut |_, _| ())?;
 //! assert_eq!(baked.model.mode_count(), 6);
 //! assert!(baked.model.info().residual_max < 1e-8);
@@ -68,7 +68,7 @@ mod physics_tests;
 pub use anchor::{Anchor, AnchorSyntax, Comparison};
 pub use bake::bake;
 pub use cache::{BakeCache, BakeKey, CachedBake, METHOD_VERSION, bake_cached};
-pub use config::{Bake, BakeConfig, BakeTimes, Stage};
+pub use config::{Bake, BakeConfig, BakeTimes, MaterialSyntax, Stage};
 pub use error::BakeError;
 pub use nonlinear::{DeadLoad, Deflection, PrescribedPatch, StaticLoads, deflect};
 pub use pliant_modal::Material;

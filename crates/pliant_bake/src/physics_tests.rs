@@ -38,7 +38,7 @@ fn omegas(mesh: &TetMesh, element: Element, config: &BakeConfig, average: Option
 
 /// Makes a configuration with `mu = 1` and `rho = 1`.
 fn unit_shear(poisson: f64, modes: usize) -> BakeConfig {
-    BakeConfig { young: 2.0 * (1.0 + poisson), poisson, density: 1.0, modes, ..BakeConfig::default() }
+    BakeConfig { young: 2.0 * (1.0 + poisson), poisson, density: 1.0, modes, ..BakeConfig::linear() }
 }
 
 fn worst(got: &[f64], expected: &[f64]) -> f64 {
@@ -145,7 +145,7 @@ fn cantilever_bends_as_timoshenko_says() {
         density,
         modes: 8,
         anchors: vec!["x<=0".parse().unwrap()],
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let got = omegas(&mesh, Element::Tet10, &config, None);
     let exact = timoshenko(young, nu, density, 2.0, 0.15, 3);
@@ -167,7 +167,7 @@ fn rod_has_its_axial_modes() {
         density,
         modes: 30,
         anchors: vec!["x<=0".parse().unwrap()],
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let got = omegas(&mesh, Element::Tet10, &config, None);
     for k in 1..=2 {
@@ -183,7 +183,7 @@ fn rod_has_its_axial_modes() {
 fn modes_and_residual_flexibility_make_the_full_static_stiffness() {
     let mesh = shapes::bar([10, 3, 3], [1.0, 0.3, 0.3]).unwrap();
     for anchors in [vec![], vec!["x<=0".parse::<Anchor>().unwrap()]] {
-        let config = BakeConfig { modes: 12, anchors, ..BakeConfig::default() };
+        let config = BakeConfig { modes: 12, anchors, ..BakeConfig::linear() };
         let fe = FeMesh::new(&mesh, Element::Tet10);
         let graph = fe.graph(false);
         let held = support::anchored_nodes(&fe, &config).unwrap();

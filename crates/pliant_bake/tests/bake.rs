@@ -41,7 +41,7 @@ fn the_same_bits_whatever_the_threads() {
     for (element, anchors, poisson) in
         [(Element::Tet4, anchor("x<0.01"), 0.3), (Element::Tet10, vec![], 0.3), (Element::Tet4, vec![], 0.48)]
     {
-        let config = BakeConfig { element, anchors, poisson, modes: 20, ..BakeConfig::default() };
+        let config = BakeConfig { element, anchors, poisson, modes: 20, ..BakeConfig::linear() };
         let hashes = [1, 2, 5].map(|threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| run(&mesh, &config).unwrap().model.hash())
@@ -59,8 +59,7 @@ fn small_regular_meshes_are_never_refused_as_inaccurate() {
                     [(anchor("x<0.001"), 1e5), (anchor("x<0.001"), 1e9), (vec![], 1e5), (vec![], 1e9)]
                 {
                     let mesh = shapes::bar([cells, across, across], [0.2, 0.12, 0.12]).unwrap();
-                    let config =
-                        BakeConfig { modes, anchors, young, sites: Some(1), ..BakeConfig::default() };
+                    let config = BakeConfig { modes, anchors, young, sites: Some(1), ..BakeConfig::linear() };
                     match run(&mesh, &config) {
                         Ok(made) => assert!(made.model.info().residual_max <= 1e-7),
                         // The smallest meshes have fewer coordinates.
@@ -86,7 +85,7 @@ fn equal_parts_have_equal_modes_all_of_them() {
         many.nodes.extend(one.nodes.iter().map(|&[x, y, z]| [x, y + f64::from(copy), z]));
         many.tets.extend(one.tets.iter().map(|tet| tet.map(|node| first + node)));
     }
-    let config = BakeConfig { modes: 20, anchors: anchor("x<0.001"), ..BakeConfig::default() };
+    let config = BakeConfig { modes: 20, anchors: anchor("x<0.001"), ..BakeConfig::linear() };
     let lowest = run(&one, &config).unwrap().model.omega()[0];
     let first = run(&many, &config).unwrap().model;
     for omega in first.omega() {
@@ -99,7 +98,7 @@ fn equal_parts_have_equal_modes_all_of_them() {
 
 #[test]
 fn mass_properties_are_those_of_the_bar() {
-    let config = BakeConfig { modes: 4, density: 500.0, ..BakeConfig::default() };
+    let config = BakeConfig { modes: 4, density: 500.0, ..BakeConfig::linear() };
     let model = run(&bar(), &config).unwrap().model;
     assert!((model.mass() - 20.0).abs() < 1e-10);
     for (got, expected) in model.center_of_mass().iter().zip([0.5, 0.1, 0.1]) {
@@ -131,7 +130,7 @@ fn gravity_participation_stretches_the_hanging_bar() {
         poisson: 0.0,
         modes: 60,
         anchors: anchor("x<0.001"),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let model = run(&mesh, &config).unwrap().model;
     let tip = model.surface().positions().iter().position(|p| p[0] > 0.999).unwrap() as u32;
@@ -149,7 +148,7 @@ fn gravity_participation_stretches_the_hanging_bar() {
 #[test]
 fn rotation_basis_is_the_slope_of_the_bending_mode() {
     let mesh = shapes::bar([30, 1, 1], [3.0, 0.1, 0.1]).unwrap();
-    let config = BakeConfig { poisson: 0.0, modes: 2, anchors: anchor("x<0.001"), ..BakeConfig::default() };
+    let config = BakeConfig { poisson: 0.0, modes: 2, anchors: anchor("x<0.001"), ..BakeConfig::linear() };
     let model = run(&mesh, &config).unwrap().model;
     for mode in 0..2 {
         for (v, p) in model.surface().positions().iter().enumerate().filter(|(_, p)| p[0] > 2.999) {
@@ -166,7 +165,7 @@ fn rotation_basis_is_the_slope_of_the_bending_mode() {
 
 #[test]
 fn damping_follows_its_law() {
-    let base = BakeConfig { modes: 5, anchors: anchor("x<0.001"), ..BakeConfig::default() };
+    let base = BakeConfig { modes: 5, anchors: anchor("x<0.001"), ..BakeConfig::linear() };
     let ratio = run(&bar(), &BakeConfig { damping: Damping::Ratio(0.05), ..base.clone() }).unwrap().model;
     let rayleigh = BakeConfig { damping: Damping::Rayleigh { alpha: 0.5, beta: 1e-3 }, ..base };
     let rayleigh = run(&bar(), &rayleigh).unwrap().model;
@@ -182,7 +181,7 @@ fn a_skin_moves_with_the_tetrahedra() {
     let mesh = bar();
     let (boundary, _) = mesh.boundary();
     for element in [Element::Tet4, Element::Tet10] {
-        let config = BakeConfig { element, modes: 8, anchors: anchor("x<0.001"), ..BakeConfig::default() };
+        let config = BakeConfig { element, modes: 8, anchors: anchor("x<0.001"), ..BakeConfig::linear() };
         let plain = run(&mesh, &config).unwrap().model;
         // The skin is the boundary itself, followed by the midpoints of the first edges of its
         // triangles.
@@ -215,7 +214,7 @@ fn a_skin_moves_with_the_tetrahedra() {
         triangles: vec![[0, 1, 2]],
         uvs: None,
     };
-    let config = BakeConfig { modes: 2, ..BakeConfig::default() };
+    let config = BakeConfig { modes: 2, ..BakeConfig::linear() };
     assert!(matches!(
         bake(&mesh, Some(&far), &config, &mut |_, _| ()),
         Err(BakeError::SkinFar { vertex: 2, .. })
@@ -224,7 +223,7 @@ fn a_skin_moves_with_the_tetrahedra() {
 
 #[test]
 fn bad_numbers_are_refused_by_name() {
-    let ok = BakeConfig { modes: 3, ..BakeConfig::default() };
+    let ok = BakeConfig { modes: 3, ..BakeConfig::linear() };
     for young in [0.0, -1.0, f64::NAN, f64::INFINITY] {
         let refused = run(&bar(), &BakeConfig { young, ..ok.clone() });
         assert!(matches!(refused, Err(BakeError::Parameter { name: "Young's modulus", .. })), "{young}");
@@ -256,7 +255,7 @@ fn bad_numbers_are_refused_by_name() {
 
 #[test]
 fn bad_meshes_and_anchors_are_refused_by_name() {
-    let ok = BakeConfig { modes: 3, ..BakeConfig::default() };
+    let ok = BakeConfig { modes: 3, ..BakeConfig::linear() };
     let with = |anchors: &[&str]| BakeConfig {
         anchors: anchors.iter().map(|a| a.parse().unwrap()).collect(),
         ..ok.clone()
@@ -293,7 +292,7 @@ fn bad_meshes_and_anchors_are_refused_by_name() {
 #[test]
 fn exported_matrices_hold_the_mass_and_know_no_force_in_translation() {
     let folder = std::env::temp_dir().join(format!("pliant-export-{}", std::process::id()));
-    let config = BakeConfig { modes: 3, export_matrices: Some(folder.clone()), ..BakeConfig::default() };
+    let config = BakeConfig { modes: 3, export_matrices: Some(folder.clone()), ..BakeConfig::linear() };
     let model = run(&bar(), &config).unwrap().model;
     for (name, expected) in [("K.mtx", 0.0), ("M.mtx", model.mass())] {
         let text = std::fs::read_to_string(folder.join(name)).unwrap();

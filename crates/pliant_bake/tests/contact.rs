@@ -14,7 +14,7 @@ use pliant_modal::{
 const GRAVITY: f64 = 9.81;
 
 fn model(mesh: &TetMesh, young: f64, change: impl Fn(&mut BakeConfig)) -> Arc<ModalModel> {
-    let mut config = BakeConfig { modes: 30, young, poisson: 0.3, sites: Some(100), ..BakeConfig::default() };
+    let mut config = BakeConfig { modes: 30, young, poisson: 0.3, sites: Some(100), ..BakeConfig::linear() };
     change(&mut config);
     Arc::new(bake(mesh, None, &config, &mut |_, _| {}).unwrap().model)
 }

@@ -22,7 +22,7 @@ fn bar(young: f64) -> Arc<ModalModel> {
         young,
         damping: Damping::Ratio(0.02),
         anchors: vec!["x<0.001".parse().unwrap()],
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     Arc::new(bake(&mesh, None, &config, &mut |_, _| {}).unwrap().model)
 }

@@ -20,7 +20,7 @@ fn bar() -> Arc<ModalModel> {
         density: DENSITY,
         damping: Damping::Ratio(0.5),
         anchors: vec!["x<0.001".parse().unwrap()],
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     Arc::new(bake(&mesh, None, &config, &mut |_, _| {}).unwrap().model)
 }

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use pliant_bake::{Bake, BakeConfig, Material, PrescribedPatch, StaticLoads, bake, deflect};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, GrabId, HeldShapes, ModalModel, Patch, StepError, StepSettings,
+    Body, BodyConfig, Elasticity, GrabConfig, GrabId, HeldShapes, ModalModel, Patch, Relaxation, StepError,
+    StepSettings,
 };
 
 type Vector = [f64; 3];
@@ -239,6 +240,77 @@ fn a_bar_that_is_clamped_at_both_ends_pulls_back_as_the_full_solution() {
         println!("middle by {by}: force and surface off by {with:.4?}, without {without:.4?}");
         assert!(with[0] < bounds[0] && with[1] < bounds[1], "{by}: {with:?}");
     }
+}
+
+/// Of a held body whose material relaxes, all forces fall by the same share, so that the shape stays
+/// and the force in the hand is that of the elastic body times the modulus. At first it is the full
+/// solution's, and at last `1 - ratio` of it.
+#[test]
+fn the_force_of_a_relaxing_body_with_shapes_falls_as_its_modulus() {
+    let (mesh, config) = (slender(), config());
+    let model = model(&mesh, &config);
+    let patch = Patch::around(model.surface(), vertex(&model, [0.5, 0.1, 0.05]), 0.05).unwrap();
+    let way = [0.0, 0.08, 0.0];
+    let held = [PrescribedPatch { patch: patch.clone(), displacement: way }];
+    let loads = StaticLoads { prescribed: &held, ..Default::default() };
+    let full = deflect(&mesh, &config, Material::NeoHookean, &loads).unwrap().reactions[0];
+    let relaxation = Relaxation { ratio: 0.6, time: 8.0 };
+    let settings = StepSettings {
+        elasticity: Elasticity::Reduced,
+        damping_scale: 30.0,
+        relaxation: Some(relaxation),
+        ..Default::default()
+    };
+    let step = 1.0 / 60.0;
+    let mut body = Body::new(model.clone(), BodyConfig { step, ..settings.into() }).unwrap();
+    let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+    let start = body.target(grab).unwrap();
+    let mut worst = 0.0f64;
+    for i in 1..=3_600 {
+        // The way takes a tenth of a second, and the mean of its times counts as its time.
+        let share = (f64::from(i) / 6.0).min(1.0);
+        body.set_target(grab, std::array::from_fn(|k| start[k] + share * way[k])).unwrap();
+        if i == 7 {
+            body.make_held_shapes().unwrap();
+        }
+        body.step().unwrap();
+        let t = f64::from(i) * step;
+        if i >= 120 && i % 60 == 0 {
+            let want = full.map(|f| relaxation.modulus(t - 0.05) * f);
+            let off = norm(minus(body.reaction(grab).unwrap(), want)) / norm(full);
+            worst = worst.max(off);
+            if [120, 480, 1_200, 3_600].contains(&i) {
+                println!(
+                    "after {t:.0} s {:.3} N, the law {:.3} N",
+                    norm(body.reaction(grab).unwrap()),
+                    norm(want)
+                );
+            }
+        }
+    }
+    println!("off by {:.2} % of the first force at worst", 100.0 * worst);
+    assert!(worst < 0.03, "{worst}");
+    // Let go, it gains nothing: its motion and what is left of its elastic energy for long strains,
+    // which no measure of what the relaxed branch stores enters, stay below what was stored.
+    let begun = body.energy();
+    let lasting = |body: &Body| {
+        let mut state = body.state().clone();
+        state.v.fill(0.0);
+        state.z.clear();
+        let mut still = body.clone();
+        still
+            .reconfigure(BodyConfig { step, ..StepSettings { relaxation: None, ..settings }.into() })
+            .unwrap();
+        still.set_state(&state).unwrap();
+        body.kinetic_energy() + (1.0 - relaxation.ratio) * still.energy()
+    };
+    body.release(grab);
+    let most = (0..600).fold(0.0f64, |most, _| {
+        body.step().unwrap();
+        most.max(lasting(&body))
+    });
+    println!("of {begun:.4} J, {most:.4} J are there at most after the release");
+    assert!(most <= begun * 1.001, "{most} of {begun}");
 }
 
 #[test]

@@ -21,7 +21,7 @@ fn model(mesh: &TetMesh, young: f64, anchor: Option<&str>) -> Arc<ModalModel> {
         sites: Some(usize::MAX),
         anchors: anchor.map(|text| text.parse().unwrap()).into_iter().collect(),
         damping: Damping::Ratio(0.3),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     Arc::new(bake(mesh, None, &config, &mut |_, _| {}).unwrap().model)
 }

@@ -29,7 +29,7 @@ fn a_rod_of_two_materials_stretches_as_the_closed_form_says() {
         poisson: 0.0,
         anchors: vec!["x<1e-9".parse().unwrap()],
         regions: regions(&["x<0.5: stiffness 7, density 0.25"]),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let mesh = shapes::bar([8, 2, 2], [1.0, 0.1, 0.1]).unwrap();
     let loads = StaticLoads { gravity: [g, 0.0, 0.0], ..Default::default() };
@@ -61,7 +61,7 @@ fn a_stiff_hull_raises_the_frequency_as_composite_beams_say() {
             &format!("y<{}: stiffness 10, density 2", 0.25 * side),
             &format!("y>{}: stiffness 10, density 2", 0.75 * side),
         ]),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let model = model(&mesh, &config);
     let inner = side * (side / 2.0f64).powi(3) / 12.0;
@@ -85,7 +85,7 @@ fn a_stiff_hull_raises_the_frequency_as_composite_beams_say() {
 #[test]
 fn a_heavy_half_moves_the_center_of_mass() {
     let mesh = shapes::bar([4, 2, 2], [0.4, 0.2, 0.2]).unwrap();
-    let config = BakeConfig { modes: 4, regions: regions(&["x<0.2: density 3"]), ..BakeConfig::default() };
+    let config = BakeConfig { modes: 4, regions: regions(&["x<0.2: density 3"]), ..BakeConfig::linear() };
     let model = model(&mesh, &config);
     let half = 1000.0 * 0.2f64.powi(3);
     assert!((model.mass() / (4.0 * half) - 1.0).abs() < 1e-12);
@@ -102,7 +102,7 @@ fn core() -> BakeConfig {
         poisson: 0.3,
         anchors: vec!["x<1e-9".parse().unwrap()],
         regions: regions(&["y>0.05 & y<0.15 & z>0.05 & z<0.15: stiffness 50, density 2"]),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     }
 }
 
@@ -155,7 +155,7 @@ fn painted_values_are_those_of_regions_and_anchors() {
         modes: 5,
         anchors: vec!["x<0.15".parse().unwrap()],
         regions: regions(&["x>-1: stiffness 3, density 2"]),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     let surface = mesh.boundary().0;
     let count = surface.positions.len();

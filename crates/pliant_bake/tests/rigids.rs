@@ -20,7 +20,7 @@ fn cube(young: f64) -> Arc<ModalModel> {
     let mut mesh = shapes::bar([4, 4, 4], [EDGE; 3]).unwrap();
     mesh.nodes.iter_mut().flatten().for_each(|x| *x -= 0.5 * EDGE);
     let damping = Damping::Ratio(0.1);
-    let config = BakeConfig { modes: 20, young, damping, ..BakeConfig::default() };
+    let config = BakeConfig { modes: 20, young, damping, ..BakeConfig::linear() };
     Arc::new(bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model)
 }
 

@@ -7,7 +7,7 @@ use clap::Args;
 use pliant_bake::{Anchor, BakeCache, BakeConfig, Region, Stage, bake_cached};
 use pliant_lab::{Progress, fill::fill};
 use pliant_mesh::{Repair, io};
-use pliant_modal::{Damping, Element, Material, ModalModel};
+use pliant_modal::{Damping, Element, ModalModel};
 use serde::Serialize;
 
 use crate::CliError;
@@ -27,12 +27,13 @@ pub(crate) struct BakeArgs {
     /// Finite element: tet4 or tet10
     #[arg(long, default_value = "tet10", value_parser = element)]
     element: Element,
-    /// Elastic modes to keep, or coordinates with a material [default: 60, or 36 with a material]
+    /// Coordinates to keep, or elastic modes of a linear body [default: 36, or 60 if linear]
     #[arg(long, allow_negative_numbers = true)]
     modes: Option<usize>,
-    /// Material for large strains: neo-hookean, st-venant-kirchhoff, or linear for none
-    #[arg(long, default_value = "linear", value_parser = material)]
-    material: Law,
+    /// Material for large strains: neo-hookean, st-venant-kirchhoff, or linear for none, which has
+    /// a smaller file and a cheaper step
+    #[arg(long, value_name = "NAME", default_value_t = BakeConfig::default().material_name())]
+    material: String,
     /// Young's modulus, 1e-3 to 1e15 Pa
     #[arg(long, value_name = "PA", default_value_t = 1e5, allow_hyphen_values = true)]
     young: f64,
@@ -85,19 +86,6 @@ fn element(text: &str) -> Result<Element, String> {
         "tet4" => Ok(Element::Tet4),
         "tet10" => Ok(Element::Tet10),
         _ => Err("expected tet4 or tet10".to_owned()),
-    }
-}
-
-/// Material of a bake, or none. An `Option` would be an optional argument.
-#[derive(Debug, Clone, Copy)]
-struct Law(Option<Material>);
-
-fn material(text: &str) -> Result<Law, String> {
-    match text {
-        "linear" => Ok(Law(None)),
-        "neo-hookean" => Ok(Law(Some(Material::NeoHookean))),
-        "st-venant-kirchhoff" => Ok(Law(Some(Material::StVenantKirchhoff))),
-        _ => Err("expected neo-hookean, st-venant-kirchhoff or linear".to_owned()),
     }
 }
 
@@ -161,7 +149,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
     }
     let mut name = args.input.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
     name.truncate(name.floor_char_boundary(ModalModel::MAX_TEXT));
-    let defaults = BakeConfig::default();
+    let defaults = BakeConfig::of_material(&args.material)?;
     let damping = match (args.rayleigh, args.damping_ratio) {
         (Some([alpha, beta]), _) => Damping::Rayleigh { alpha, beta },
         (None, Some(zeta)) => Damping::Ratio(zeta),
@@ -170,12 +158,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
     let config = BakeConfig {
         name,
         element: args.element,
-        modes: args.modes.unwrap_or(if args.material.0.is_some() {
-            BakeConfig::COORDINATES
-        } else {
-            defaults.modes
-        }),
-        material: args.material.0,
+        modes: args.modes.unwrap_or(defaults.modes),
         young: args.young,
         poisson: args.poisson,
         density: args.density,

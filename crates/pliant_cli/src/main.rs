@@ -102,6 +102,8 @@ enum CliError {
     Mesh(#[from] pliant_mesh::MeshError),
     #[error("{0}")]
     Bake(#[from] pliant_bake::BakeError),
+    #[error("--material: {0}")]
+    Material(#[from] pliant_bake::MaterialSyntax),
     #[error("{0}")]
     File(#[from] pliant_modal::FileError),
     #[error("--tets: {0} holds tetrahedra already; expected a surface or a scene, or no --tets")]

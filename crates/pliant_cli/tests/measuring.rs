@@ -11,7 +11,20 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     let folder = Folder::new("stream");
     let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
     succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
-    succeeds(&["bake", &mesh, "--element", "tet4", "--modes", "12", "--anchor", "x<0.01", "-o", &model]);
+    succeeds(&[
+        "bake",
+        &mesh,
+        "--material",
+        "linear",
+        "--element",
+        "tet4",
+        "--modes",
+        "12",
+        "--anchor",
+        "x<0.01",
+        "-o",
+        &model,
+    ]);
     let run = |recovery: &str, seed: &str| {
         let text = succeeds(&[
             "stream",
@@ -152,7 +165,20 @@ fn a_body_is_timed_against_the_memory() {
     let folder = Folder::new("bench");
     let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
     succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
-    succeeds(&["bake", &mesh, "--element", "tet4", "--modes", "12", "--anchor", "x<0.01", "-o", &model]);
+    succeeds(&[
+        "bake",
+        &mesh,
+        "--material",
+        "linear",
+        "--element",
+        "tet4",
+        "--modes",
+        "12",
+        "--anchor",
+        "x<0.01",
+        "-o",
+        &model,
+    ]);
     let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
     for times in ["step_us", "reconstruct_us"] {
         let at = |part: &str| told[times][part].as_f64().unwrap();
@@ -183,7 +209,20 @@ fn a_body_is_timed_against_the_memory() {
     // Four times as many vertices and twice the modes take at least three times as long.
     let (fine, finer) = (folder.file("fine.msh"), folder.file("fine.modal"));
     succeeds(&["mesh", "bar", "--cells", "16,4,4", "--size", "1,0.2,0.2", "-o", &fine]);
-    succeeds(&["bake", &fine, "--element", "tet4", "--modes", "24", "--anchor", "x<0.01", "-o", &finer]);
+    succeeds(&[
+        "bake",
+        &fine,
+        "--material",
+        "linear",
+        "--element",
+        "tet4",
+        "--modes",
+        "24",
+        "--anchor",
+        "x<0.01",
+        "-o",
+        &finer,
+    ]);
     let larger = json(&succeeds(&["bench", "step", &finer, "--seconds", "0.05", "--json"]));
     let longer = median(&larger, "reconstruct_us") / median(&told, "reconstruct_us");
     println!("a surface of 24 modes and four times the vertices takes {longer:.1} times as long");
@@ -203,7 +242,7 @@ fn a_pull_feels_a_beam_as_timoshenko_says() {
     let (mesh, model, pulled) = (folder.file("bar.msh"), folder.file("bar.modal"), folder.file("out.ply"));
     succeeds(&["mesh", "bar", "--cells", "20,2,2", "--size", "1,0.1,0.1", "-o", &mesh]);
     let bake = ["bake", &mesh, "--modes", "20", "--young", "2e6", "--poisson", "0", "--anchor", "x<0.001"];
-    succeeds(&[&bake[..], &["--rayleigh", "0,0", "-o", &model]].concat());
+    succeeds(&[&bake[..], &["--material", "linear", "--rayleigh", "0,0", "-o", &model]].concat());
     let at = ["pull", &model, "--at", "1,0.05,0.05", "--radius", "0.08"];
     let by = |by: &str| json(&succeeds(&[&at[..], &["--by", by, "--json"]].concat()));
     // w = P L^3 / (3 E I) + P L / (k G A) with k = 10 (1 + nu) / (12 + 11 nu).

@@ -143,6 +143,7 @@ fn a_surface_is_filled_and_wears_a_skin() {
         "--json",
     ]);
     let baked = json(&baked);
+    assert_eq!(baked["material"], "neo-hookean", "the default");
     assert_eq!(baked["surface_vertices"], 6);
     assert_eq!(baked["rigid_modes"], 6);
     assert!((baked["mass_kg"].as_f64().unwrap() / (4000.0 / 3.0) - 1.0).abs() < 0.02, "of 4/3 m^3");
@@ -337,6 +338,8 @@ fn bad_input_is_refused_and_leaves_no_file() {
         (&[mesh, "--young", "soft"], "invalid"),
         (&[mesh, "--poisson", "0.5"], "Poisson"),
         (&[mesh, "--poisson", "-1"], "Poisson"),
+        (&[mesh, "--poisson", "0.49"], "a material other than linear"),
+        (&[mesh, "--material", "rubber"], "expected neo-hookean, st-venant-kirchhoff or linear"),
         (&[mesh, "--density", "0"], "density"),
         (&[mesh, "--young", "1e300"], "1e-3 to 1e15 Pa"),
         (&[mesh, "--density", "1e-300"], "1e-6 to 1e7 kg/m^3"),

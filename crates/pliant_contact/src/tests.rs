@@ -28,7 +28,8 @@ static CUBE: LazyLock<Arc<ModalModel>> = LazyLock::new(|| {
     let mut mesh = pliant_mesh::shapes::bar([3, 3, 3], [EDGE; 3]).unwrap();
     mesh.nodes.iter_mut().flatten().for_each(|x| *x -= 0.5 * EDGE);
     let damping = pliant_modal::Damping::Ratio(0.1);
-    let config = pliant_bake::BakeConfig { modes: 12, young: 1e6, damping, ..Default::default() };
+    let config =
+        pliant_bake::BakeConfig { modes: 12, young: 1e6, damping, ..pliant_bake::BakeConfig::linear() };
     Arc::new(pliant_bake::bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model)
 });
 

@@ -180,9 +180,21 @@ fn made_of(scene: &SceneDescription, body: &BodyEntry, at: &dyn Fn(&'static str)
             let inner = |field| [at("bake").as_slice(), &[Field(field)]].concat();
             asset(&inner("shape"), &bake.shape, "a shape")?;
             within(&inner("tets"), "tetrahedra", bake.tets as f64, 10.0..=200_000.0)?;
-            within(&inner("modes"), "modes", bake.modes as f64, 1.0..=500.0)?;
+            let linear = match bake.material.as_str() {
+                "linear" => true,
+                "neo-hookean" | "st-venant-kirchhoff" => false,
+                other => {
+                    let other: String = other.chars().take(80).collect();
+                    let message = format!(
+                        "expected a material, `neo-hookean`, `st-venant-kirchhoff` or `linear`, got {other:?}"
+                    );
+                    return Err(fault(&inner("material"), SceneErrorKind::Value, message));
+                }
+            };
+            let (most, poisson) = if linear { (500.0, 0.49999) } else { (120.0, 0.45) };
+            within(&inner("modes"), "modes", bake.modes as f64, 1.0..=most)?;
             within(&inner("young"), "Young's modulus in Pa", bake.young, 1e-3..=1e15)?;
-            within(&inner("poisson"), "a Poisson ratio", bake.poisson, -0.99..=0.49999)?;
+            within(&inner("poisson"), "a Poisson ratio", bake.poisson, -0.99..=poisson)?;
             within(&inner("density"), "a density in kg/m^3", bake.density, 1e-6..=1e7)?;
             within(&inner("damping_ratio"), "a damping ratio", bake.damping_ratio, 0.0..=1000.0)?;
             if bake.anchors.len() > 100 {

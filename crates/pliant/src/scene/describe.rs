@@ -143,13 +143,17 @@ pub struct BakeEntry {
     /// Approximate number of tetrahedra, 10 to 200,000. Default: 4000.
     #[serde(default = "tets")]
     pub tets: usize,
-    /// Number of modes, 1 to 500. Default: 20.
+    /// Number of coordinates, 1 to 120, or of modes of a linear body, 1 to 500. Default: 36.
     #[serde(default = "bake_modes")]
     pub modes: usize,
+    /// Material for large strains: `"neo-hookean"`, `"st-venant-kirchhoff"`, or `"linear"` for
+    /// none. Default: neo-Hookean.
+    #[serde(default = "bake_material")]
+    pub material: String,
     /// Young's modulus, Pa, 1e-3 to 1e15. Default: 1e5, a soft silicone.
     #[serde(default = "young")]
     pub young: f64,
-    /// Poisson ratio, -0.99 to 0.49999. Default: 0.4.
+    /// Poisson ratio, -0.99 to 0.45, and to 0.49999 for a linear body. Default: 0.4.
     #[serde(default = "poisson")]
     pub poisson: f64,
     /// Density, kg/m^3, 1e-6 to 1e7. Default: 1000.
@@ -172,7 +176,11 @@ fn tets() -> usize {
 }
 
 fn bake_modes() -> usize {
-    20
+    36
+}
+
+fn bake_material() -> String {
+    "neo-hookean".into()
 }
 
 fn young() -> f64 {

@@ -382,6 +382,8 @@ fn spawn_body(
         use crate::body::{BakeRequest, BakeShape};
         use crate::modal::Damping;
         let root = world.get_resource::<AssetRoot>().map(|root| root.0.clone()).unwrap_or_default();
+        // The check of the scene has read this text, too.
+        let of_material = BakeConfig::of_material(&bake.material).unwrap_or_default();
         let config = BakeConfig {
             name: body.name.clone(),
             modes: bake.modes,
@@ -392,7 +394,7 @@ fn spawn_body(
             // The check of the scene has parsed these texts before.
             anchors: bake.anchors.iter().filter_map(|anchor| anchor.parse::<Anchor>().ok()).collect(),
             regions: bake.regions.iter().filter_map(|region| region.parse::<Region>().ok()).collect(),
-            ..default()
+            ..of_material
         };
         let shape = BakeShape::File(root.join(&bake.shape));
         let request = BakeRequest { tets: bake.tets, config, ..BakeRequest::new(shape) };

@@ -10,7 +10,7 @@ use bevy::{
     prelude::*,
     tasks::futures_lite::AsyncWriteExt,
 };
-use pliant_bake::{AnchorSyntax, BakeConfig, RegionSyntax, bake};
+use pliant_bake::{AnchorSyntax, BakeConfig, MaterialSyntax, RegionSyntax, bake};
 use pliant_mesh::{
     StuffOptions,
     io::{Input, parse_surface},
@@ -50,8 +50,11 @@ pub struct BakeProcessor;
 pub struct BakeSettings {
     /// Approximate number of tetrahedra. Default: 10,000.
     pub tets: usize,
-    /// Number of modes. Default: 60.
+    /// Number of coordinates, or of modes of a linear body. Default: 36.
     pub modes: usize,
+    /// Material for large strains: `"neo-hookean"`, `"st-venant-kirchhoff"`, or `"linear"` for
+    /// none. Default: neo-Hookean.
+    pub material: String,
     /// Young's modulus, Pa. Default: 1e5.
     pub young: f64,
     /// Poisson ratio. Default: 0.4.
@@ -68,9 +71,11 @@ pub struct BakeSettings {
 
 impl Default for BakeSettings {
     fn default() -> Self {
-        let BakeConfig { modes, young, poisson, density, .. } = BakeConfig::default();
+        let config = BakeConfig::default();
+        let material = config.material_name();
+        let BakeConfig { modes, young, poisson, density, .. } = config;
         let (anchors, regions) = (Vec::new(), Vec::new());
-        Self { tets: 10_000, modes, young, poisson, density, damping_ratio: 0.03, anchors, regions }
+        Self { tets: 10_000, modes, material, young, poisson, density, damping_ratio: 0.03, anchors, regions }
     }
 }
 
@@ -81,6 +86,8 @@ enum BakeFileError {
     Anchor(#[from] AnchorSyntax),
     #[error("{0}")]
     Region(#[from] RegionSyntax),
+    #[error("{0}")]
+    Material(#[from] MaterialSyntax),
     #[error("{0}")]
     Bake(#[from] BakeBodyError),
 }
@@ -95,7 +102,7 @@ impl BakeSettings {
             damping: Damping::Ratio(self.damping_ratio),
             anchors: self.anchors.iter().map(|text| text.parse()).collect::<Result<_, _>>()?,
             regions: self.regions.iter().map(|text| text.parse()).collect::<Result<_, _>>()?,
-            ..BakeConfig::default()
+            ..BakeConfig::of_material(&self.material)?
         };
         // Invalid settings are refused before the long work starts.
         config.check().map_err(BakeBodyError::from)?;

@@ -29,7 +29,7 @@ fn bar(modes: usize) -> BakeRequest {
         modes,
         anchors: vec!["x<0.001".parse().unwrap()],
         sites: Some(8),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     BakeRequest { config, ..BakeRequest::new(shapes::bar([12, 3, 3], [1.0, 0.2, 0.2]).unwrap().into()) }
 }
@@ -176,12 +176,26 @@ fn a_dirty_surface_is_mended_and_says_how() {
     ball.triangles[7].swap(0, 1);
     ball.triangles.pop();
     let mut app = baking_app(None);
-    let config = BakeConfig { modes: 3, sites: Some(8), ..BakeConfig::default() };
+    let config = BakeConfig { modes: 3, sites: Some(8), ..BakeConfig::linear() };
     let entity =
         app.world_mut().spawn(BakeRequest { tets: 1000, config, ..BakeRequest::new(ball.into()) }).id();
     let seen = wait(&mut app, entity);
     let Some(BakeProgress::Done { repair: Some(repair), .. }) = seen.last() else { panic!("{seen:?}") };
     assert_eq!((repair.turned_triangles, repair.covered_holes), (1, 1), "{repair}");
+}
+
+#[test]
+fn a_bake_without_a_word_has_the_material_of_large_strains() {
+    let mut app = baking_app(None);
+    let bar = shapes::bar([4, 1, 1], [0.4, 0.1, 0.1]).unwrap();
+    let config = BakeConfig { sites: Some(8), ..BakeConfig::default() };
+    let entity = app.world_mut().spawn(BakeRequest { config, ..BakeRequest::new(bar.into()) }).id();
+    wait(&mut app, entity);
+    app.update();
+    assert!(state(&app, entity).body().model().material().is_some());
+    let processed = crate::BakeSettings::default();
+    let default = BakeConfig::default();
+    assert_eq!((processed.modes, processed.material), (default.modes, default.material_name()));
 }
 
 #[test]
@@ -233,7 +247,7 @@ fn painted_box() -> Mesh {
 }
 
 fn of_mesh(mesh: Handle<Mesh>) -> BakeRequest {
-    let config = BakeConfig { modes: 6, sites: Some(8), ..BakeConfig::default() };
+    let config = BakeConfig { modes: 6, sites: Some(8), ..BakeConfig::linear() };
     BakeRequest { tets: 1_500, config, ..BakeRequest::mesh(mesh) }
 }
 

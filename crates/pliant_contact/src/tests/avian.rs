@@ -136,7 +136,8 @@ fn a_crate_of_a_hundred_times_the_mass_rests_on_a_stiffer_body() {
     let mut mesh = pliant_mesh::shapes::bar([3, 3, 3], [EDGE; 3]).unwrap();
     mesh.nodes.iter_mut().flatten().for_each(|x| *x -= 0.5 * EDGE);
     let damping = pliant_modal::Damping::Ratio(0.1);
-    let config = pliant_bake::BakeConfig { modes: 12, young: 1e8, damping, ..Default::default() };
+    let config =
+        pliant_bake::BakeConfig { modes: 12, young: 1e8, damping, ..pliant_bake::BakeConfig::linear() };
     let model = Arc::new(pliant_bake::bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model);
     let mass = 100.0 * model.mass();
     let mut app = earth();

@@ -40,7 +40,7 @@ pub(super) fn config(element: Element, modes: usize, anchors: Vec<Anchor>) -> Ba
         damping: Damping::Ratio(0.05),
         anchors,
         sites: Some(64),
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     }
 }
 

@@ -250,7 +250,7 @@ fn body() -> Result<Arc<ModalModel>, LabError> {
         density: 100.0,
         damping: Damping::Ratio(0.05),
         anchors: vec![Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 }],
-        ..BakeConfig::default()
+        ..BakeConfig::linear()
     };
     Ok(Arc::new(bake(&shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?, None, &config, &mut |_, _| ())?.model))
 }

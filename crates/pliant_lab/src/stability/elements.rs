@@ -65,7 +65,7 @@ impl Form {
             modes: 24,
             damping: Damping::Ratio(0.3),
             anchors: vec![Anchor { axis: 0, comparison: Comparison::Less, bound }],
-            ..BakeConfig::default()
+            ..BakeConfig::linear()
         }
     }
 }
