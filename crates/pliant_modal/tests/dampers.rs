@@ -87,126 +87,61 @@ fn energy(body: &Body, grabs: &[GrabId]) -> f64 {
     body.energy() + grabs.iter().map(spring).sum::<f64>()
 }
 
-/// A second after the targets have come to rest, the energy must not grow for any pair of dampers.
-/// Within that second, [`what_a_long_damper_gives_back_is_its_work_over_the_way`] bounds it.
+/// From the first step on in which the targets rest, the energy must not grow for any pair of
+/// dampers.
+///
+/// Take a hand with the compliance `C` and the relaxation time `r`, a body without damping and a
+/// step of first order. Over the step the patch goes the way `d`, and the gap to the target shrinks
+/// from `g0` to `g1 = g0 - d`. The force `F` is constant and obeys `C F = g1 - r d / h`. The modes
+/// take the work `F . d` without any error (the step is exact), and the spring of the hand gives
+/// `(g0 + g1) . C^-1 d / 2`. The energy of the step then changes by
+///
+/// ```text
+/// E1 - E0 = F . d - (g0 + g1) . C^-1 d / 2 = -(r / h + 1 / 2) d . C^-1 d
+/// ```
+///
+/// which is never positive. A damper on the velocity at the end of the step has no such bound: a
+/// mode that turns within the step ends it against its way. Up to 6.6 % of the largest energy came
+/// back so.
 #[test]
 fn dampers_take_energy() {
     let times = [0.0, 0.01, 0.1, 0.5, 2.0, 10.0];
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
+    let mut worst = 0.0f64;
     for (integrator, second_order) in [(Integrator::Exact, true), (Integrator::Exact, false), (alpha, true)] {
-        for step in [1.0 / 40.0, 1.0 / 240.0] {
+        for step in [1.0 / 40.0, 1.0 / 60.0, 1.0 / 240.0] {
             for warp in [false, true] {
                 for first in times {
                     for second in times {
-                        // Two dampers of ten seconds still give back 2.0e-4 of the energy then, at
-                        // first order with the warp. Nothing else gains 1e-9.
-                        let lags = warp && !second_order && f64::min(first, second) > 2.0;
-                        let room = if lags { 3e-4 } else { 1e-9 };
                         let (mut body, grabs) = held(step, integrator, second_order, warp, [first, second]);
                         let starts = grabs.map(|grab| body.target(grab).unwrap());
-                        let mut least = f64::INFINITY;
-                        let mut most = 0.0f64;
-                        for k in 0..(6.0 / step) as usize {
-                            let t = k as f64 * step;
-                            let share = (t / 0.25).min(1.0);
+                        let (mut least, mut most) = (f64::INFINITY, 0.0f64);
+                        let mut grown = 0.0f64;
+                        for k in 0..(3.0 / step) as usize {
+                            let share = (k as f64 * step / 0.25).min(1.0);
                             for (i, (grab, [x, y, z])) in grabs.into_iter().zip(starts).enumerate() {
                                 let way = 0.02 * share * if i == 0 { 1.0 } else { -0.5 };
                                 body.set_target(grab, [x + way, y + 0.3 * way, z]).unwrap();
                             }
+                            let before = energy(&body, &grabs);
                             body.step().unwrap();
                             let now = energy(&body, &grabs);
                             most = most.max(now);
-                            if t > 1.0 {
-                                assert!(
-                                    now <= least + room * most,
-                                    "{integrator:?}, second order {second_order}, {step} s, warp {warp}, dampers {first} s and {second} s: \
-                                     {now} J after {least} J, at {t} s"
-                                );
-                                least = least.min(now);
+                            if (k as f64 - 1.0) * step >= 0.25 - 1e-9 {
+                                least = least.min(before);
+                                grown = grown.max((now - least) / most);
                             }
                         }
+                        if grown > 1e-9 {
+                            println!(
+                                "{integrator:?}, second order {second_order}, {step} s, warp {warp}, dampers {first} s and {second} s: {grown:.1e}"
+                            );
+                        }
+                        worst = worst.max(grown);
                     }
                 }
             }
         }
     }
-}
-
-/// Where the targets rest, the energy of a step changes by what its damping forces and its springs
-/// say, and by nothing else.
-///
-/// Take a hand with the compliance `C` and the relaxation time `r`, a body without damping and a
-/// step of first order. Over the step the patch goes the way `d = u1 - u0`, and the gap to the
-/// target shrinks from `g0` to `g1 = g0 - d`. The force `F` is constant and obeys
-/// `C F = g1 - r v`, with the velocity `v` of the patch at the end of the step. The modes take the
-/// work `F . d` without any error (the step is exact), and the spring of the hand gives
-/// `(g0 + g1) . C^-1 d / 2`. With `D = F - C^-1 g1 = -r C^-1 v`, the force of the damper,
-///
-/// ```text
-/// E1 - E0 = F . d - (g0 + g1) . C^-1 d / 2 = D . d - d . C^-1 d / 2
-/// ```
-///
-/// The second term only takes energy. The first one does too while the patch ends the step in the
-/// direction in which it went, as it does when the step resolves the motion. A mode that turns
-/// within a step may end it against its way: the damper then gives energy back. That is bounded by
-/// the motion itself, since with no way there is no work, and each such turn costs the second term
-/// too. Most of it comes when the targets stop: 7 % of the largest energy for dampers of ten
-/// seconds at 60 Hz, 2 % for those of a second. [`dampers_take_energy`] shows that it is over a
-/// second later.
-#[test]
-fn what_a_long_damper_gives_back_is_its_work_over_the_way() {
-    let times = [[0.01, 0.01], [0.1, 0.1], [1.0, 0.0], [1.0, 1.0], [10.0, 2.0], [10.0, 10.0]];
-    let mut given = 0.0f64;
-    for (step, relaxations) in
-        [40.0, 60.0, 240.0].into_iter().flat_map(|rate| times.map(|times| (1.0 / rate, times)))
-    {
-        let [undamped, damped] = [0.0, 1.0].map(|damping_scale| {
-            let (mut body, grabs) = held(step, Integrator::Exact, false, false, relaxations);
-            let mut config = body.config().clone();
-            config.settings.damping_scale = damping_scale;
-            body.reconfigure(config).unwrap();
-            let starts = grabs.map(|grab| body.target(grab).unwrap());
-            let stiffness = grabs.map(|grab| {
-                let compliance = body.compliance(grab).unwrap();
-                Matrix3::from_fn(|i, j| compliance[i][j]).try_inverse().unwrap()
-            });
-            let places = |body: &Body| grabs.map(|grab| Vector3::from(body.grab_position(grab).unwrap()));
-            let (mut least, mut most, mut grown) = (f64::INFINITY, 0.0f64, 0.0f64);
-            for k in 0..(6.0 / step) as usize {
-                let share = (k as f64 * step / 0.25).min(1.0);
-                for (i, (grab, [x, y, z])) in grabs.into_iter().zip(starts).enumerate() {
-                    let way = 0.02 * share * if i == 0 { 1.0 } else { -0.5 };
-                    body.set_target(grab, [x + way, y + 0.3 * way, z]).unwrap();
-                }
-                let (from, before) = (places(&body), energy(&body, &grabs));
-                body.step().unwrap();
-                let (to, now) = (places(&body), energy(&body, &grabs));
-                most = most.max(now);
-                // From the first step on in which the targets stand still.
-                if (k as f64 - 1.0) * step < 0.25 - 1e-9 {
-                    continue;
-                }
-                let mut expected = 0.0;
-                for (i, grab) in grabs.into_iter().enumerate() {
-                    let (way, end) = (to[i] - from[i], Vector3::from(body.target(grab).unwrap()));
-                    let force = -Vector3::from(body.reaction(grab).unwrap());
-                    let damper = force - stiffness[i] * (end - to[i]);
-                    expected += damper.dot(&way) - 0.5 * way.dot(&(stiffness[i] * way));
-                }
-                let off = now - before - expected;
-                // Damping of the body's own takes some more.
-                let right = if damping_scale == 0.0 { off.abs() < 1e-9 * most } else { off < 1e-9 * most };
-                assert!(right, "{step} s, {relaxations:?} s: off by {off} J of {most} J");
-                least = least.min(before);
-                grown = grown.max((now - least) / most);
-            }
-            grown
-        });
-        println!(
-            "dampers of {relaxations:?} s, steps of {step:.4} s: {undamped:.1e} come back, {damped:.1e} in a damped body"
-        );
-        assert!(damped <= undamped && undamped < 0.1, "{undamped} and {damped}");
-        given = given.max(undamped);
-    }
-    assert!(given > 1e-3, "nothing comes back any more: tell so in docs/limits.md");
+    assert!(worst < 1e-9, "{worst}");
 }

@@ -55,7 +55,8 @@ pub struct Load<'a> {
 struct Solving {
     /// The patch's six numbers after the step without hands.
     free: Six,
-    /// Velocities of the six numbers without hands. Only set if the hand has a damper.
+    /// Mean velocities of the six numbers over the step without hands. Only set if the hand has a
+    /// damper.
     speed: Six,
     /// The six numbers at which the tangent is taken.
     from: Six,
@@ -112,15 +113,12 @@ pub struct Kernel {
     start: Vec<f64>,
     /// Error of the bend force in the previous round, and the force which that round computed.
     rounds: Vec<[f64; 2]>,
-    /// Modal velocities as dampers use them.
-    velocity: Vec<f64>,
     /// Contact forces over this step.
     push: touch::ContactPush,
     solving: Vec<Solving>,
     /// Forces of the hands on the six numbers of their patches.
     forces: Vec<Six>,
     responses: Grams,
-    dampers: Grams,
     system: System,
 }
 
@@ -178,12 +176,10 @@ impl Kernel {
             bend: zero.clone(),
             start: zero.clone(),
             rounds: vec![[0.0; 2]; zero.len()],
-            velocity: zero.clone(),
             push: touch::ContactPush { modal: zero, ..Default::default() },
             solving: Vec::new(),
             forces: Vec::new(),
             responses: Grams::default(),
-            dampers: Grams::default(),
             system: System::default(),
             model,
             settings,
@@ -209,7 +205,6 @@ impl Kernel {
         self.before = self.at_rest();
         self.prepare_weight();
         self.responses.forget();
-        self.dampers.forget();
         Ok(())
     }
 
@@ -368,9 +363,6 @@ impl Kernel {
     /// nothing.
     pub fn prepare(&mut self, hands: &[Hand]) {
         self.responses.prepare(hands, &self.modes.response[0]);
-        if hands.iter().any(|hand| hand.config().relaxation > 0.0) {
-            self.dampers.prepare(hands, &self.modes.damper);
-        }
         self.solving.reserve(hands.len().saturating_sub(self.solving.len()));
         self.forces.reserve(hands.len().saturating_sub(self.forces.len()));
         self.system.reserve(hands.len());

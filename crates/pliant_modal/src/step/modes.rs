@@ -15,8 +15,6 @@ pub(crate) struct Modes {
     free: [[Vec<f64>; 4]; 3],
     /// Change of q, v, a per unit modal force.
     pub(crate) response: [Vec<f64>; 3],
-    /// Change of the velocity that a damper uses per unit modal force, see [`Modes::velocities`].
-    pub(crate) damper: Vec<f64>,
     /// Whether the step also uses the old acceleration and force.
     memory: bool,
     viscous: Option<Viscous>,
@@ -71,7 +69,6 @@ impl Modes {
                 std::array::from_fn(|column| made.iter().map(|c| c.free[row][column]).collect())
             }),
             response: std::array::from_fn(|row| made.iter().map(|c| c.response[row]).collect()),
-            damper: made.iter().map(|c| c.response[1].max(c.response[0] / h)).collect(),
             memory: settings.integrator != Integrator::Exact && !reduced,
             viscous,
             relaxes: settings.relaxation.is_some(),
@@ -131,19 +128,6 @@ impl Modes {
             for ((out, response), force) in out.iter_mut().zip(response).zip(force) {
                 *out += response * force;
             }
-        }
-    }
-
-    /// Computes the modal velocities that dampers use.
-    ///
-    /// For each mode this is the velocity at the end of the step or the mean over the step,
-    /// whichever responds more to a force. A mode that turns by more than half a period within a
-    /// step responds with an end velocity in the opposite direction, and a damper on this velocity
-    /// would add energy.
-    pub(crate) fn velocities(&self, before: &State, after: &State, h: f64, out: &mut [f64]) {
-        for (k, out) in out.iter_mut().enumerate().take(self.count()) {
-            let at_end = self.response[1][k] >= self.response[0][k] / h;
-            *out = if at_end { after.v[k] } else { (after.q[k] - before.q[k]) / h };
         }
     }
 }

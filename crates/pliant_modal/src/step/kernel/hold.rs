@@ -8,11 +8,8 @@ use super::{Kernel, Solving, StepReport};
 use crate::{
     HeldShapes,
     step::{
-        Frame, Hand, Hold, RigidMotion, State, StepSettings,
-        constraint::ViscoelasticPatch,
-        elastic::RoundTangent,
-        patch::{Grams, tangent},
-        predicted_frame::PredictedFrame,
+        Frame, Hand, Hold, RigidMotion, State, StepSettings, constraint::ViscoelasticPatch,
+        elastic::RoundTangent, patch::tangent, predicted_frame::PredictedFrame,
     },
 };
 
@@ -155,10 +152,6 @@ impl Kernel {
     /// hands.
     fn begin(&mut self, state: &mut State, hands: &[Hand]) {
         let warp = self.warps();
-        let damped = hands.iter().any(|hand| hand.config().relaxation > 0.0);
-        if damped {
-            self.modes.velocities(&self.before, state, self.h, &mut self.velocity);
-        }
         let beyond = self.settings.extrapolation(&self.model, state.modes(), hands.len());
         if let Some(elastic) = &mut self.elastic {
             let relaxed = hands.iter().map(|hand| (&*hand.patch, self.creep.relaxed_force(hand)));
@@ -188,9 +181,7 @@ impl Kernel {
                     None => self.creep.creep_displacement(&hand.viscoelastic),
                 };
                 solving.relaxation = config.relaxation;
-                if config.relaxation > 0.0 {
-                    solving.speed = hand.patch.rows().reduce(&self.velocity, warp);
-                }
+                solving.speed = (solving.free - solving.from) / self.h;
             }
             self.solving.push(solving);
         }
@@ -207,9 +198,7 @@ impl Kernel {
             solving.free = elastic.without_hands(&hand.patch);
             solving.from = solving.free;
             if solving.relaxation > 0.0 {
-                // Dampers see the mean velocity over the step.
-                let before = elastic.at_beginning(&hand.patch);
-                solving.speed = (solving.free - before) / self.h;
+                solving.speed = (solving.free - elastic.at_beginning(&hand.patch)) / self.h;
             }
             if tangent != RoundTangent::Kept {
                 solving.compliance = turned(&self.creep, elastic.shapes(), hand, elastic.coordinates());
@@ -231,7 +220,6 @@ impl Kernel {
         rigid: Option<&RigidMotion>,
     ) -> usize {
         let relaxations = || self.solving.iter().map(|s| s.relaxation);
-        let damped = relaxations().any(|r| r > 0.0);
         let first = relaxations().next().unwrap_or(0.0);
         self.system.clear(3 * hands.len(), relaxations().all(|r| r == first));
         let right = self.system.right().as_chunks_mut::<3>().0;
@@ -257,6 +245,9 @@ impl Kernel {
                     if config.relaxation > 0.0 {
                         let frame =
                             rigid.map_or_else(Vector3::zeros, |_| unheld.velocity_at(&self.model, ahead));
+                        // The mean velocity of the step, along the tangent on which the force
+                        // acts: what a damper takes from the modes is then never less than zero,
+                        // whatever they do within the step.
                         let speed = place.turn * (solving.tangent * solving.speed) + frame;
                         gap += solving.lead - config.relaxation * speed;
                     }
@@ -270,18 +261,11 @@ impl Kernel {
         }
         for (i, a) in self.solving.iter().enumerate() {
             for (j, b) in self.solving[..=i].iter().enumerate() {
-                let across = |grams: &Grams| a.tangent * grams.at(i, j) * b.tangent.transpose();
-                let mut position = across(&self.responses);
-                let mut velocity = match (damped, self.elastic.is_some()) {
-                    (false, _) => Matrix3::zeros(),
-                    (true, true) => position / self.h,
-                    (true, false) => across(&self.dampers),
-                };
+                let mut position = a.tangent * self.responses.at(i, j) * b.tangent.transpose();
                 if let Some(rigid) = rigid {
-                    let response = rigid.velocity_response(&a.arm, &b.arm);
-                    position += self.h * response;
-                    velocity += response;
+                    position += self.h * rigid.velocity_response(&a.arm, &b.arm);
                 }
+                let velocity = position / self.h;
                 if i == j {
                     position += (1.0 + a.beyond) * a.compliance;
                 }
