@@ -145,3 +145,48 @@ fn dampers_take_energy() {
     }
     assert!(worst < 1e-9, "{worst}");
 }
+
+/// Reactions on one hand at the ticks of 60 Hz, N. The target goes to and fro by 2 cm within two
+/// seconds, and trembles by 1 mm at 8 Hz if asked.
+fn felt(rate: usize, stiffness: Option<f64>, relaxation: f64, trembles: bool) -> Vec<Vector3<f64>> {
+    let model = pip();
+    let config = BodyConfig { step: 1.0 / rate as f64, ..Default::default() };
+    let mut body = Body::new(model.clone(), config).unwrap();
+    let patch = Patch::around(model.surface(), 76, 0.0216).unwrap();
+    let grab = body.grab(&patch, GrabConfig { stiffness, relaxation }).unwrap();
+    let start = body.target(grab).unwrap();
+    let mut forces = Vec::new();
+    for k in 1..=4 * rate {
+        let t = k as f64 / rate as f64;
+        let slow = 0.01 * (1.0 - (std::f64::consts::PI * t).cos());
+        let tremor = if trembles { 0.001 * (16.0 * std::f64::consts::PI * t).sin() } else { 0.0 };
+        body.set_target(grab, [start[0] + slow, start[1] + tremor, start[2]]).unwrap();
+        body.step().unwrap();
+        if k % (rate / 60) == 0 {
+            forces.push(Vector3::from(body.reaction(grab).unwrap()));
+        }
+    }
+    forces
+}
+
+/// The reaction on a hand with a damper, against steps of 1/7680 s.
+#[test]
+fn a_damper_is_felt_as_with_fine_steps() {
+    let cases = [
+        ("400 N/m, 0.01 s, slow", Some(400.0), 0.01, false, [0.002, 0.001, 0.0005]),
+        ("400 N/m, 0.01 s, trembles", Some(400.0), 0.01, true, [0.07, 0.028, 0.011]),
+        ("no spring, 0.1 s, slow", None, 0.1, false, [0.004, 0.0016, 0.0006]),
+        ("no spring, 1 s, slow", None, 1.0, false, [0.008, 0.0045, 0.002]),
+    ];
+    for (name, stiffness, relaxation, trembles, bounds) in cases {
+        let fine = felt(7680, stiffness, relaxation, trembles);
+        let largest = fine.iter().map(|f| f.norm()).fold(0.0, f64::max);
+        let off = [60, 120, 240].map(|rate| {
+            let coarse = felt(rate, stiffness, relaxation, trembles);
+            let sum: f64 = coarse.iter().zip(&fine).map(|(a, b)| (a - b).norm_squared()).sum();
+            (sum / fine.len() as f64).sqrt() / largest
+        });
+        println!("{name}: {:.4?} of {largest:.2} N", off);
+        assert!(off.iter().zip(bounds).all(|(off, bound)| *off < bound), "{name}: {off:?}");
+    }
+}
