@@ -3,7 +3,11 @@
 use nalgebra::{Matrix3, Vector3};
 
 use crate::warp::coefficients;
-use crate::{ModalModel, StepError, error::finite};
+use crate::{
+    ModalModel, StepError,
+    error::finite,
+    simd::{Work, widest},
+};
 
 /// Motion of the anchors of a body through the world at one moment. The anchors move as one rigid
 /// frame.
@@ -149,29 +153,13 @@ impl MassSites {
     pub(crate) fn add(&self, by: &MassForce, q: &[f64], force: &mut [f64]) -> f64 {
         let mut six = self.reduce(q);
         let work = self.work_and_forces(by, &mut six);
-        for (force, rows) in force.iter_mut().zip(&self.modes) {
-            let mut sums = [0.0; SITES];
-            for (row, part) in rows.iter().zip(&six) {
-                for ((sum, row), part) in sums.iter_mut().zip(row).zip(part) {
-                    *sum += row * part;
-                }
-            }
-            *force += sums.iter().sum::<f64>();
-        }
+        widest(Spread { modes: &self.modes, six: &six, force });
         work
     }
 
     /// Linear displacement (m) and rotation (rad) of each part.
     fn reduce(&self, q: &[f64]) -> [Each; 6] {
-        let mut six = [[0.0; SITES]; 6];
-        for (q, rows) in q.iter().zip(&self.modes) {
-            for (sum, row) in six.iter_mut().zip(rows) {
-                for (sum, row) in sum.iter_mut().zip(row) {
-                    *sum += q * row;
-                }
-            }
-        }
-        six
+        widest(Reduce { modes: &self.modes, q })
     }
 
     /// Returns the work for the six numbers of each part and replaces these numbers by the
@@ -198,6 +186,52 @@ impl MassSites {
             }
         }
         work
+    }
+}
+
+/// Sums the displacements and rotations of the parts.
+struct Reduce<'a> {
+    modes: &'a [[Each; 6]],
+    q: &'a [f64],
+}
+
+impl Work for Reduce<'_> {
+    type Out = [Each; 6];
+    #[inline(always)]
+    fn run(self) -> [Each; 6] {
+        let mut six = [[0.0; SITES]; 6];
+        // The sums of one row fit into the registers.
+        for (k, sums) in six.iter_mut().enumerate() {
+            for (q, rows) in self.q.iter().zip(self.modes) {
+                for (sum, row) in sums.iter_mut().zip(&rows[k]) {
+                    *sum += q * row;
+                }
+            }
+        }
+        six
+    }
+}
+
+/// Adds the modal forces of forces on the parts.
+struct Spread<'a> {
+    modes: &'a [[Each; 6]],
+    six: &'a [Each; 6],
+    force: &'a mut [f64],
+}
+
+impl Work for Spread<'_> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        for (force, rows) in self.force.iter_mut().zip(self.modes) {
+            let mut sums = [0.0; SITES];
+            for (row, part) in rows.iter().zip(self.six) {
+                for ((sum, row), part) in sums.iter_mut().zip(row).zip(part) {
+                    *sum += row * part;
+                }
+            }
+            *force += sums.iter().sum::<f64>();
+        }
     }
 }
 
