@@ -126,19 +126,53 @@ pub(crate) struct Ride {
     /// way.
     applied: Option<[DVec3; 2]>,
     applied_until: f64,
+    /// Whether all ways and what has acted are zero, so that nothing comes before the entity moves.
+    stands: bool,
 }
 
 impl Ride {
     /// Number of ways that are kept, more than fit into the longest delay.
     const WAYS: usize = 6;
 
+    /// Takes a look at an entity that stood and has not moved since. Returns whether it is one:
+    /// [`Ride::look`] would then find no motion.
+    fn still_stands(&mut self, affine: &Affine3A, [tick, frame]: [f64; 2], late: [f64; 2]) -> bool {
+        let Some(last) = self.last.as_mut().filter(|last| self.stands && is_same(affine, &last.affine))
+        else {
+            return false;
+        };
+        if self.outside {
+            return false;
+        }
+        let (before, now) = if self.by_tick { (last.tick, tick) } else { (last.frame, frame) };
+        (last.tick, last.frame) = (tick, frame);
+        // Of the ways without a motion only the newest one matters, as that from which a motion
+        // begins.
+        if let (Some(way), true) = (self.ways.last_mut(), now > before) {
+            (way.seconds, way.middle) = (now - before, 0.5 * (now + before));
+        }
+        self.wait(tick, late);
+        true
+    }
+
+    /// Moves the time up to which the motion acts to that of a tick, s. `late` is the delay that
+    /// follows from the lengths of the last tick and of the last frame, for motion by ticks and by
+    /// frames.
+    fn wait(&mut self, tick: f64, late: [f64; 2]) {
+        let late = late[usize::from(!self.by_tick)];
+        // Frames differ in length.
+        self.delay = if self.delay > 0.0 { 0.9 * self.delay + 0.1 * late } else { late };
+        self.applied_until = (tick - self.delay).max(self.applied_until);
+    }
+
     /// Takes a look, and returns the motion over the step that comes, in world lengths.
     ///
     /// Velocities belong to the middles of ways, and change evenly from middle to middle. Where
     /// frames and ticks differ, the body feels them some time late, so that there always is a next
     /// middle. The forces are then as smooth as the motion.
-    fn look(&mut self, now: Look, step: f64, frame: f64, teleported: bool) -> FrameMotion {
+    fn look(&mut self, now: Look, step: f64, late: [f64; 2], teleported: bool) -> FrameMotion {
         let moved = std::mem::take(&mut self.outside);
+        self.stands = false;
         let Some(last) = self.last.replace(now) else { return FrameMotion::default() };
         let is_still = !moved && is_same(&now.affine, &last.affine);
         if !is_still && self.by_tick == moved {
@@ -150,7 +184,11 @@ impl Ride {
         let seconds = time(&now) - time(&last);
         // Without a frame since the last look, the entity goes on as it did.
         if seconds > 0.0 || teleported {
-            let way = now.pose.velocity_since(&last.pose, seconds).filter(|_| !teleported);
+            let way = match is_still {
+                true => Some([DVec3::ZERO; 2]),
+                false => now.pose.velocity_since(&last.pose, seconds),
+            };
+            let way = way.filter(|_| !teleported);
             if way.is_none() {
                 // What was turned goes on ahead.
                 let turn = now.pose.orientation * last.pose.orientation.inverse();
@@ -171,13 +209,10 @@ impl Ride {
                 self.ways.push(Way { middle, seconds, velocity, orientation });
             }
         }
-        // The middle of the last way is at most so old.
-        let late = if self.by_tick { 0.5 * step } else { 1.5 * frame + 0.5 * step };
-        // Frames differ in length.
-        self.delay = if self.delay > 0.0 { 0.9 * self.delay + 0.1 * late } else { late };
-        let until = (now.tick - self.delay).max(self.applied_until);
-        let middle = 0.5 * (until + self.applied_until.max(until - step));
-        self.applied_until = until;
+        let applied_until = self.applied_until;
+        self.wait(now.tick, late);
+        let until = self.applied_until;
+        let middle = 0.5 * (until + applied_until.max(until - step));
         let (Some((velocity, orientation)), Some((_, axes))) = (self.at(until), self.at(middle)) else {
             return FrameMotion::default();
         };
@@ -197,6 +232,9 @@ impl Ride {
                 *acceleration = axes.inverse() * (change / step);
             }
         }
+        let none = [DVec3::ZERO; 2];
+        let waits = self.ways.len() == Self::WAYS && self.ways.iter().all(|way| way.velocity == none);
+        self.stands = waits && *applied == none;
         let [acceleration, angular_acceleration] = accelerations.map(Into::into);
         let angular_velocity = (orientation.inverse() * applied[1]).into();
         FrameMotion { acceleration, angular_velocity, angular_acceleration }
@@ -218,28 +256,39 @@ fn is_same(a: &Affine3A, b: &Affine3A) -> bool {
     a.to_cols_array().map(f32::to_bits) == b.to_cols_array().map(f32::to_bits)
 }
 
-fn place(global: &GlobalTransform) -> (Affine3A, Pose) {
-    let (_, rotation, translation) = global.to_scale_rotation_translation();
+/// An entity whose motion is looked at.
+type Rider = (Entity, &'static Transform, Has<ChildOf>);
+
+/// Where an entity is by the transforms as they are now. Its `GlobalTransform` is that of the last
+/// frame.
+fn place((entity, local, is_child): (Entity, &Transform, bool), all: &TransformHelper) -> Option<Affine3A> {
+    match is_child {
+        true => all.compute_global_transform(entity).ok().map(|global| global.affine()),
+        false => Some(local.compute_affine()),
+    }
+}
+
+fn pose(affine: &Affine3A) -> Option<Pose> {
+    let (_, rotation, translation) = affine.to_scale_rotation_translation();
     let pose = Pose { origin: translation.as_dvec3(), orientation: rotation.as_dquat().normalize() };
-    (global.affine(), pose)
+    (pose.origin.is_finite() && pose.orientation.is_finite()).then_some(pose)
 }
 
 /// Notes which entities have moved since the last tick: outside of the fixed loop.
-pub(crate) fn begin_tick(
-    transforms: TransformHelper,
-    mut rides: Query<(Entity, &mut Ride), With<BodyState>>,
-) {
-    // Bodies that feel no motion are not looked at.
-    for (entity, mut ride) in rides.iter_mut().filter(|(_, ride)| ride.last.is_some()) {
-        let Ok(now) = transforms.compute_global_transform(entity) else { continue };
-        ride.outside |= ride.left.is_some_and(|left| !is_same(&left, &now.affine()));
+pub(crate) fn begin_tick(transforms: TransformHelper, mut rides: Query<(Rider, &mut Ride), With<BodyState>>) {
+    for (rider, mut ride) in &mut rides {
+        // Bodies that feel no motion are not looked at.
+        let Some(left) = ride.left.filter(|_| ride.last.is_some()) else { continue };
+        if place(rider, &transforms).is_some_and(|now| !is_same(&left, &now)) {
+            ride.outside = true;
+        }
     }
 }
 
 /// Notes where the entities are at the end of a tick.
-pub(crate) fn end_tick(transforms: TransformHelper, mut rides: Query<(Entity, &mut Ride), With<BodyState>>) {
-    for (entity, mut ride) in rides.iter_mut().filter(|(_, ride)| ride.last.is_some()) {
-        ride.left = transforms.compute_global_transform(entity).ok().map(|now| now.affine());
+pub(crate) fn end_tick(transforms: TransformHelper, mut rides: Query<(Rider, &mut Ride), With<BodyState>>) {
+    for (rider, mut ride) in rides.iter_mut().filter(|(_, ride)| ride.last.is_some()) {
+        ride.left = place(rider, &transforms);
     }
 }
 
@@ -258,13 +307,16 @@ pub(crate) fn ride(
     parents: Query<&ChildOf>,
     mut teleports: MessageReader<Teleport>,
     mut refusals: Refusals,
-    mut bodies: Query<(NameOrEntity, &Inertia, &Driven, &mut Ride, &mut BodyState), With<ModalBody>>,
+    mut bodies: Query<(NameOrEntity, Rider, &Inertia, &Driven, &mut Ride, &mut BodyState), With<ModalBody>>,
 ) {
     let teleports: Vec<Entity> = teleports.read().map(|teleport| teleport.0).collect();
     let step = time.delta_secs_f64();
     let tick = time.elapsed_secs_f64();
-    let frame = frames.elapsed_secs_f64() - frames.delta_secs_f64();
-    for (name, inertia, driven, mut ride, mut state) in &mut bodies {
+    let frame_length = frames.delta_secs_f64();
+    let frame = frames.elapsed_secs_f64() - frame_length;
+    // The middle of the last way is at most so old.
+    let late = [0.5 * step, 1.5 * frame_length + 0.5 * step];
+    for (name, rider, inertia, driven, mut ride, mut state) in &mut bodies {
         let factor = inertia.factor();
         if *driven != Driven::Local || state.model().is_free() || factor <= 0.0 {
             if ride.last.is_some() {
@@ -272,10 +324,12 @@ pub(crate) fn ride(
             }
             continue;
         }
-        let global = transforms.compute_global_transform(name.entity).ok();
-        let (affine, pose) = global.as_ref().map(place).unzip();
-        let pose = pose.filter(|pose| pose.origin.is_finite() && pose.orientation.is_finite());
-        let (Some(affine), Some(pose)) = (affine, pose) else {
+        let affine = place(rider, &transforms);
+        let stood = |affine: &Affine3A| ride.still_stands(affine, [tick, frame], late);
+        if teleports.is_empty() && affine.as_ref().is_some_and(stood) {
+            continue;
+        }
+        let Some((affine, pose)) = affine.and_then(|affine| Some((affine, pose(&affine)?))) else {
             *ride = Ride::default();
             continue;
         };
@@ -284,7 +338,7 @@ pub(crate) fn ride(
             !teleports.is_empty() && (on_it(name.entity) || parents.iter_ancestors(name.entity).any(on_it));
         let look = Look { affine, pose, tick, frame };
         let FrameMotion { acceleration, angular_velocity, angular_acceleration } =
-            ride.look(look, step, frames.delta_secs_f64(), teleported);
+            ride.look(look, step, late, teleported);
         let times = |vector: [f64; 3], factor: f64| vector.map(|x| factor * x);
         let motion = FrameMotion {
             acceleration: times(acceleration, factor / state.scale),
