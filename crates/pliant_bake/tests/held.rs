@@ -243,8 +243,8 @@ fn a_bar_that_is_clamped_at_both_ends_pulls_back_as_the_full_solution() {
 }
 
 /// Of a held body whose material relaxes, all forces fall by the same share, so that the shape
-/// stays and the force in the hand is that of the elastic body times the modulus. At first it is the full
-/// solution's, and at last `1 - ratio` of it.
+/// stays and the force in the hand is that of the elastic body times the modulus. At first it is
+/// the full solution's, and at last `1 - ratio` of it.
 #[test]
 fn the_force_of_a_relaxing_body_with_shapes_falls_as_its_modulus() {
     let (mesh, config) = (slender(), config());
