@@ -22,7 +22,8 @@ pub struct Publish {
     #[arg(long, value_name = "HASH")]
     pub certificate: Option<String>,
 
-    /// Address of the relay in the link for watchers, where it is another one than the host's.
+    /// Address of the relay in the link for watchers, where it is another one than the host's, or
+    /// with a token for watchers. The host's own token is never in the link.
     #[arg(long, value_name = "URL")]
     pub link_relay: Option<String>,
 
@@ -53,14 +54,14 @@ impl Publish {
             bodies: WatchConfig { rate: self.watch_rate, modes: self.watch_modes, ..default() },
             ..PublishOptions::new(relay)
         };
-        println!("to watch in a browser: {}", options.link(&self.page));
-        app.insert_resource(Wanted(Some(options))).add_systems(Update, publish);
+        let link = options.link(&self.page);
+        app.insert_resource(Wanted(Some((options, link)))).add_systems(Update, publish);
         Ok(())
     }
 }
 
 #[derive(Resource)]
-struct Wanted(Option<PublishOptions>);
+struct Wanted(Option<(PublishOptions, String)>);
 
 fn publish(
     mut wanted: ResMut<Wanted>,
@@ -69,11 +70,14 @@ fn publish(
     mut said: Local<u64>,
 ) {
     let Some(mut host) = host else { return };
-    if let Some(options) = wanted.0.take()
-        && let Err(error) = host.publish_to_watchers(options)
-    {
-        error!("nothing is published: {error}");
-        exit.write(AppExit::error());
+    if let Some((options, link)) = wanted.0.take() {
+        match host.publish_to_watchers(options) {
+            Ok(()) => println!("to watch in a browser: {link}"),
+            Err(error) => {
+                error!("nothing is published: {error}");
+                exit.write(AppExit::error());
+            }
+        }
     }
     if let Some((_, stats)) = host.published()
         && stats.connections != *said

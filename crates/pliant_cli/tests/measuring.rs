@@ -6,9 +6,9 @@ mod support;
 
 use support::{Folder, json, program, refused, succeeds};
 
-#[test]
-fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
-    let folder = Folder::new("stream");
+/// Makes a bar of linear elements and bakes 12 linear modes of it. Returns the paths of mesh
+/// and model.
+fn bar(folder: &Folder) -> [String; 2] {
     let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
     succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
     succeeds(&[
@@ -25,6 +25,13 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
         "-o",
         &model,
     ]);
+    [mesh, model]
+}
+
+#[test]
+fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
+    let folder = Folder::new("stream");
+    let [mesh, model] = bar(&folder);
     let run = |recovery: &str, seed: &str| {
         let text = succeeds(&[
             "stream",
@@ -163,22 +170,7 @@ fn reads_gb_s(bytes: usize) -> f64 {
 #[test]
 fn a_body_is_timed_against_the_memory() {
     let folder = Folder::new("bench");
-    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
-    succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
-    succeeds(&[
-        "bake",
-        &mesh,
-        "--material",
-        "linear",
-        "--element",
-        "tet4",
-        "--modes",
-        "12",
-        "--anchor",
-        "x<0.01",
-        "-o",
-        &model,
-    ]);
+    let [mesh, model] = bar(&folder);
     let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
     for times in ["step_us", "reconstruct_us"] {
         let at = |part: &str| told[times][part].as_f64().unwrap();

@@ -55,8 +55,7 @@ pub struct Load<'a> {
 struct Solving {
     /// The patch's six numbers after the step without hands.
     free: Six,
-    /// Mean velocities of the six numbers over the step without hands. Only set if the hand has a
-    /// damper.
+    /// Mean velocities of the six numbers over the step without hands, which dampers see.
     speed: Six,
     /// The six numbers at which the tangent is taken.
     from: Six,

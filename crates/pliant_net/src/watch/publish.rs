@@ -16,7 +16,7 @@ use pliant_stream::watch::{
 use pliant_stream::{BodyId, Placement, Tick, TickState};
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 
-use super::relay::{Relay, RelayOptions, WatchError};
+use super::relay::{Relay, RelayOptions, WatchError, without_token};
 
 /// Frames that wait for the thread of the relay. More are dropped and counted.
 const QUEUE: usize = 1024;
@@ -30,8 +30,8 @@ const GOODBYE: Duration = Duration::from_millis(500);
 pub struct PublishOptions {
     /// The relay and the name of the session there.
     pub relay: RelayOptions,
-    /// Address of the relay in links for watchers, where it is another one than the host's: without
-    /// the host's token, or a relay nearer to them. Default: the host's.
+    /// Address of the relay in links for watchers, where it is another one than the host's: with a
+    /// token for watchers, or a relay nearer to them. Default: the host's without its token.
     pub link_relay: Option<String>,
     /// Name of the session for display, at most 64 bytes. Default: none.
     pub title: String,
@@ -69,7 +69,8 @@ impl PublishOptions {
     /// watch-page` writes, or of another one that reads `relay`, `session` and any number of
     /// `certificate` (SHA-256 hashes) from the fragment of its own address.
     pub fn link(&self, page: &str) -> String {
-        self.relay.link(page, self.link_relay.as_ref().unwrap_or(&self.relay.relay))
+        let relay = self.link_relay.clone().unwrap_or_else(|| without_token(&self.relay.relay));
+        self.relay.link(page, &relay)
     }
 }
 

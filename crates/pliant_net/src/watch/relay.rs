@@ -84,8 +84,7 @@ impl RelayOptions {
 
     /// Link to a page that shows the session: `page` with the relay and the session in its
     /// fragment, which browsers send to no web server, and the hashes of certificates to trust. A
-    /// token in the relay's address is in the link too, so publish with another one than watchers
-    /// get, with [`PublishOptions::link_relay`](super::PublishOptions::link_relay).
+    /// token in `relay` is in the link too.
     pub(super) fn link(&self, page: &str, relay: &str) -> String {
         let mut fragment = url::form_urlencoded::Serializer::new(String::new());
         fragment.append_pair("relay", relay).append_pair("session", &self.session);
@@ -116,8 +115,8 @@ impl RelayOptions {
     }
 }
 
-/// A relay's address as logs may have it: what follows the question mark is secret.
-fn without_token(relay: &str) -> String {
+/// A relay's address as logs and watchers may have it: what follows the question mark is secret.
+pub(super) fn without_token(relay: &str) -> String {
     relay.split(['?', '#']).next().unwrap_or_default().to_owned()
 }
 
