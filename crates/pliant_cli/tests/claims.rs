@@ -131,8 +131,8 @@ fn the_warp_is_that_of_the_report() {
     }
 }
 
-/// The tip of a slender bar in pure bending, beside the circle that it really is (Choi and Ko's warp
-/// turns every place by the linear rotation of the bending mode).
+/// The tip of a slender bar in pure bending, beside the circle that it really is (Choi and Ko's
+/// warp turns every place by the linear rotation of the bending mode).
 #[test]
 fn a_bent_bar_is_off_by_what_the_theory_says() {
     let off = |degrees: f64, warped: bool| {
