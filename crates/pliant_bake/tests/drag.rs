@@ -8,8 +8,8 @@ use nalgebra::{DMatrix, Vector3};
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::shapes;
 use pliant_modal::{
-    Body, BodyConfig, Damping, Element, GrabConfig, Hand, HeldPatch, Hold, Integrator, Kernel, Load,
-    ModalModel, Patch, StepSettings,
+    Body, BodyConfig, Damping, Element, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Integrator, Kernel,
+    Load, ModalModel, Patch, StepSettings,
 };
 
 /// Makes a bar of 20 x 3 x 3 cells, 1,080 tetrahedra and 20 modes, fixed at x = 0.
@@ -174,6 +174,63 @@ fn a_rigid_hand_is_at_its_target() {
     let (rigid, soft) = (left(GrabConfig::RIGID), left(GrabConfig::default()));
     println!("{rigid:.1e} m from the target, with the residual flexibility {soft:.1e} m");
     assert!(rigid < 1e-12 && soft > 1e-6, "{rigid} and {soft}");
+}
+
+/// Equation (10) on a bar that is bent: the forces of two hands from the accelerations. What a force
+/// does to a mode is the derivative of the way of the patch by the mode's coordinate, which is taken
+/// here by differences of the warped positions.
+#[test]
+fn the_forces_of_hands_follow_from_the_accelerations_of_a_bent_bar() {
+    let model = bar(2e6);
+    let patch = |x: f32| {
+        let distance = |p: &[f32; 3]| (p[0] - x).powi(2) + (p[1] - 0.15).powi(2) + (p[2] - 0.075).powi(2);
+        let all = model.surface().positions();
+        let near = (0..all.len()).min_by(|a, b| distance(&all[*a]).total_cmp(&distance(&all[*b])));
+        Patch::around(model.surface(), near.unwrap() as u32, 0.06).unwrap()
+    };
+    let (patches, forces) = ([patch(1.0), patch(0.5)], [[0.3, 1.5, -0.4], [0.2, -0.8, 0.5]]);
+    let modes = model.mode_count();
+    let held = patches.each_ref().map(|patch| Arc::new(HeldPatch::new(&model, patch, modes).unwrap()));
+    for warp in [false, true] {
+        let settings = StepSettings { warp, ..Default::default() };
+        let kernel = Kernel::new(model.clone(), settings, modes, 1.0 / 40.0).unwrap();
+        let mut state = kernel.at_rest();
+        // The first two modes bend the end by a third of the length.
+        let unit = |k: usize| held[0].displacement(&one(modes, k, 1.0), false).norm();
+        for k in 0..modes {
+            state.q[k] = if k < 2 { 0.3 } else { 0.002 * (k as f64).cos() } / unit(k).max(1e-3);
+            state.v[k] = 0.1 * (k as f64).sin();
+        }
+        for k in 0..modes {
+            let (omega, damping) = (model.omega()[k], model.damping()[k]);
+            let mut force = 0.0;
+            for (held, pull) in held.iter().zip(forces) {
+                let step = 1e-5;
+                let at = |d: f64| {
+                    let mut q = state.q.clone();
+                    q[k] += d;
+                    held.displacement(&q, warp)
+                };
+                force += ((at(step) - at(-step)) / (2.0 * step)).dot(&Vector3::from(pull));
+            }
+            state.a[k] = force - damping * state.v[k] - omega * omega * state.q[k];
+        }
+        let mut hands = held.each_ref().map(|held| {
+            let (target, velocity) = (held.rest(), Vector3::zeros());
+            Hand::new(held.clone(), Hold::Target { target, velocity, config: GrabConfig::default() })
+        });
+        ImpliedPulls::new(&kernel).solve(&kernel, &state, &mut hands);
+        for (hand, want) in hands.iter().zip(forces) {
+            let off = (hand.pull - Vector3::from(want)).norm() / Vector3::from(want).norm();
+            println!("warp {warp}: off by {off:.1e}");
+            assert!(off < 1e-6, "warp {warp}: {:?} instead of {want:?}", hand.pull);
+        }
+    }
+}
+
+/// A vector with one number that is not 0.
+fn one(length: usize, at: usize, value: f64) -> Vec<f64> {
+    (0..length).map(|k| if k == at { value } else { 0.0 }).collect()
 }
 
 /// Steps of these lengths, s.
