@@ -177,8 +177,8 @@ fn a_rigid_hand_is_at_its_target() {
 }
 
 /// Equation (10) on a bar that is bent: the forces of two hands from the accelerations. What a
-/// force does to a mode is the derivative of the way of the patch by the mode's coordinate, which is
-/// taken here by differences of the warped positions.
+/// force does to a mode is the derivative of the way of the patch by the mode's coordinate, which
+/// is taken here by differences of the warped positions.
 #[test]
 fn the_forces_of_hands_follow_from_the_accelerations_of_a_bent_bar() {
     let model = bar(2e6);
