@@ -162,7 +162,7 @@ fn through(jump: &Jump) -> (Option<DisconnectReason>, HostSession, GuestSession,
         let guest_now = if late { t + jump.guest } else { t };
         publish(&mut host, host_now, tick);
         tick += 1;
-        let hear = |host: &mut HostSession, guest: &mut GuestSession| {
+        let exchange = |host: &mut HostSession, guest: &mut GuestSession| {
             while let Some(o) = guest.poll_output() {
                 match o.channel {
                     Channel::Datagram => host.on_datagram(host_now, PeerId(1), &o.bytes),
@@ -186,12 +186,12 @@ fn through(jump: &Jump) -> (Option<DisconnectReason>, HostSession, GuestSession,
             if k == 201 {
                 host.on_message(host_now, PeerId(1), &GuestMessage::SnapshotRequest { body: 1 }.encode());
             }
-            hear(&mut host, &mut guest);
+            exchange(&mut host, &mut guest);
         }
         host.update(host_now);
         let stepped = guest.update(guest_now);
         assert!(stepped < 20, "{stepped} ticks at once");
-        hear(&mut host, &mut guest);
+        exchange(&mut host, &mut guest);
         while let Some(e) = guest.poll_event() {
             if let GuestEvent::Closed { reason } = e {
                 ended = ended.or(Some(reason));

@@ -328,12 +328,12 @@ fn a_placement_reaches_those_who_are_there_and_those_who_come() {
     room.join(PeerId(2), &model);
     (0..4).for_each(|_| room.step());
     assert_eq!([0, 1].map(|guest| placement(&room, guest)), [Some(there); 2]);
-    let told = |room: &mut Room| {
+    let notices = |room: &mut Room| {
         std::iter::from_fn(|| room.guests[0].1.poll_event())
             .filter(|event| matches!(event, GuestEvent::BodyPlaced { .. }))
             .count()
     };
-    assert_eq!(told(&mut room), 1);
+    assert_eq!(notices(&mut room), 1);
     // The same again is not sent, and what places nothing is refused.
     room.host.set_placement(BODY, there).unwrap();
     for wrong in [
@@ -348,7 +348,7 @@ fn a_placement_reaches_those_who_are_there_and_those_who_come() {
         assert!(HostMessage::decode(&message.encode()).is_err(), "{wrong:?}");
     }
     room.exchange();
-    assert_eq!((told(&mut room), placement(&room, 0)), (0, Some(there)));
+    assert_eq!((notices(&mut room), placement(&room, 0)), (0, Some(there)));
 }
 
 #[test]

@@ -71,9 +71,9 @@ fn a_peer_is_told_of_those_that_it_lacks_and_no_more_often_than_they_come() {
         tell(now, &mut second, &mut first, two);
     }
     assert_eq!(lists.iter().sum::<usize>(), 2, "{lists:?}");
-    let told = introduced(&mut second);
-    assert_eq!(told.len(), 1, "the first list has nobody whom the second lacks: {told:?}");
-    assert_eq!(told[0], [name(3), name(4)]);
+    let lists = introduced(&mut second);
+    assert_eq!(lists.len(), 1, "the first list has nobody whom the second lacks: {lists:?}");
+    assert_eq!(lists[0], [name(3), name(4)]);
 }
 
 #[test]
@@ -134,9 +134,9 @@ fn lists_in_a_flood_are_left_out_and_long_addresses_refused() {
     for k in 0..1000u32 {
         second.on_message(S + k * Duration::from_millis(2), one, &list);
     }
-    let told = introduced(&mut second);
-    assert!((4..=5).contains(&told.len()), "two a second for two seconds: {}", told.len());
-    assert!(told.iter().all(|others| *others == [(UserId(7), "seven".to_owned())]), "{told:?}");
+    let lists = introduced(&mut second);
+    assert!((4..=5).contains(&lists.len()), "two a second for two seconds: {}", lists.len());
+    assert!(lists.iter().all(|others| *others == [(UserId(7), "seven".to_owned())]), "{lists:?}");
     let long = first.introduce(&[(UserId(3), "x".repeat(513))]);
     assert!(matches!(long, Err(StreamError::Config { what: "address", .. })), "{long:?}");
 }

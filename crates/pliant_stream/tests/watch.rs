@@ -66,7 +66,7 @@ fn shape_error(model: &ModalModel, warps: bool, got: &[f64], want: &[f64]) -> (f
     (rms / model.size(), all.iter().fold(0.0_f64, |m, x| m.max(*x)).sqrt() / model.size())
 }
 
-struct Told {
+struct Measured {
     bytes_per_second: f64,
     /// Error of what was decoded, at the ticks of the frames, over the sent coordinates.
     rounding: f64,
@@ -76,7 +76,7 @@ struct Told {
 }
 
 /// Sends a course, and draws it with straight lines between the frames.
-fn watch(model: &Arc<ModalModel>, course: &[Vec<f64>], config: WatchConfig) -> Told {
+fn watch(model: &Arc<ModalModel>, course: &[Vec<f64>], config: WatchConfig) -> Measured {
     let warps = model.parts().reduced.is_none();
     let mut encoder = BodyEncoder::new(model, config, STEP).unwrap();
     let mut decoder = BodyDecoder::new(coordinate_steps(model, config.modes));
@@ -104,7 +104,7 @@ fn watch(model: &Arc<ModalModel>, course: &[Vec<f64>], config: WatchConfig) -> T
             largest = largest.max(most);
         }
     }
-    Told {
+    Measured {
         bytes_per_second: bytes as f64 / (course.len() as f64 * STEP),
         rounding,
         rms: (sum / f64::from(count)).sqrt(),
@@ -124,29 +124,33 @@ fn bytes_against_error() {
         println!("| --- | --- | --- | --- | --- |");
         let mut before = f64::INFINITY;
         for modes in counts {
-            let told = [10.0, 30.0, 60.0].map(|rate| {
-                let told =
+            let measured = [10.0, 30.0, 60.0].map(|rate| {
+                let measured =
                     watch(&model, &course, WatchConfig { rate, modes: *modes, ..WatchConfig::default() });
-                let Told { bytes_per_second, rms, largest, .. } = told;
+                let Measured { bytes_per_second, rms, largest, .. } = measured;
                 println!(
                     "| {rate} | {modes} | {bytes_per_second:.0} | {:.2} | {:.1} |",
                     1e3 * rms,
                     1e3 * largest
                 );
                 // Half a step in each coordinate, if all were off at one vertex in one direction.
-                assert!(told.rounding < 0.5e-4 * *modes as f64, "{}", told.rounding);
-                told
+                assert!(measured.rounding < 0.5e-4 * *modes as f64, "{}", measured.rounding);
+                measured
             });
             // More frames cost more and show more.
-            assert!(told[0].bytes_per_second < told[1].bytes_per_second);
-            assert!(told[1].bytes_per_second < told[2].bytes_per_second);
-            assert!(told[0].rms > told[1].rms && told[1].rms >= told[2].rms);
+            assert!(measured[0].bytes_per_second < measured[1].bytes_per_second);
+            assert!(measured[1].bytes_per_second < measured[2].bytes_per_second);
+            assert!(measured[0].rms > measured[1].rms && measured[1].rms >= measured[2].rms);
             // More coordinates show more.
-            assert!(told[2].rms <= before, "{} after {before}", told[2].rms);
-            before = told[2].rms;
+            assert!(measured[2].rms <= before, "{} after {before}", measured[2].rms);
+            before = measured[2].rms;
             // 16 bits a coordinate without prediction, at the same steps.
             let plain = 60.0 * (2.0 * *modes as f64 + 1.0);
-            assert!(told[2].bytes_per_second < 0.6 * plain, "{} of {plain}", told[2].bytes_per_second);
+            assert!(
+                measured[2].bytes_per_second < 0.6 * plain,
+                "{} of {plain}",
+                measured[2].bytes_per_second
+            );
         }
     }
 }
@@ -160,10 +164,10 @@ fn rounding_stays_within_half_a_step() {
     let mut cost = 0.0;
     for resolution in [1e-3, 1e-4, 1e-5] {
         let config = WatchConfig { rate: 60.0, modes: 20, resolution, ..WatchConfig::default() };
-        let told = watch(&model, &course, config);
-        println!("resolution {resolution}: {:.0} bytes a second", told.bytes_per_second);
-        assert!(told.bytes_per_second > cost);
-        cost = told.bytes_per_second;
+        let measured = watch(&model, &course, config);
+        println!("resolution {resolution}: {:.0} bytes a second", measured.bytes_per_second);
+        assert!(measured.bytes_per_second > cost);
+        cost = measured.bytes_per_second;
         let mut encoder = BodyEncoder::new(&model, config, STEP).unwrap();
         let mut decoder = BodyDecoder::new(places.clone());
         for (k, q) in course.iter().enumerate() {

@@ -264,7 +264,7 @@ impl PeerBody {
         let BodyCopy { state, hands, contacts, .. } = self.rollback.at(tick)?;
         Some(PeerBodyState {
             s: state.s.clone(),
-            shapes: self.columns.told(tick),
+            shapes: self.columns.since(tick),
             body: self.id.0,
             q: state.q.clone(),
             v: state.v.clone(),

@@ -201,18 +201,18 @@ impl Columns {
         }
     }
 
-    /// What a state after `tick` tells of the sets: the one that counts then, and all later ones.
-    pub(crate) fn told(&self, tick: Tick) -> Vec<PeerShapes> {
+    /// The sets that a state after `tick` carries: the one that counts then, and all later ones.
+    pub(crate) fn since(&self, tick: Tick) -> Vec<PeerShapes> {
         let first = self.sets.iter().rposition(|set| set.from <= tick).unwrap_or(0);
-        let tell = |set: &Set| PeerShapes { from: set.from, places: set.places.clone() };
-        self.sets[first..].iter().map(tell).collect()
+        let shapes = |set: &Set| PeerShapes { from: set.from, places: set.places.clone() };
+        self.sets[first..].iter().map(shapes).collect()
     }
 
-    /// Takes what a state tells of the sets. Later ones that are known besides stay.
-    pub(crate) fn replace(&mut self, model: &ModalModel, told: &[PeerShapes]) {
+    /// Takes over the sets of a received state. Later ones that only this peer knows stay.
+    pub(crate) fn replace(&mut self, model: &ModalModel, received: &[PeerShapes]) {
         let before = std::mem::take(&mut self.sets);
         let find = |places: &[HeldPlace]| before.iter().find(|set| set.places == places);
-        for PeerShapes { from, places } in told.iter().filter(|told| fit(model, &told.places)) {
+        for PeerShapes { from, places } in received.iter().filter(|shapes| fit(model, &shapes.places)) {
             let known = find(places);
             self.sets.push(Set {
                 from: *from,
@@ -221,7 +221,7 @@ impl Columns {
                 paid: known.is_some_and(|set| set.paid),
             });
         }
-        let last = told.last().map_or(0, |told| told.from);
+        let last = received.last().map_or(0, |shapes| shapes.from);
         let room = MAX_SETS.saturating_sub(self.sets.len());
         self.sets.extend(before.into_iter().filter(|set| set.from > last).take(room));
     }

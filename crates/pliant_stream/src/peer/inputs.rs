@@ -13,10 +13,11 @@ use crate::wire::{HeldAt, ImpulseAt, InputTick};
 pub(crate) const WINDOW: usize = 128;
 
 /// Largest number of hands that act on one body, as many as at a host. A step with 32 hands takes
-/// some ten times as long as one with 8, so that a crowd would hold up everybody's frames.
+/// some ten times as long as one with 8, and would hold up everybody's frames.
 const MAX_HANDS: usize = Body::MAX_GRABS;
-/// Hands on one body whose square costs as much again as the step of the body without hands.
-const CROWD: u64 = 32;
+/// The square of the number of hands on one body, divided by this, is what they add to the cost of
+/// its step, as a number of steps without hands.
+const SQUARED_HANDS_PER_STEP: u64 = 32;
 
 /// What all users do with one body at one tick, by user.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -161,13 +162,13 @@ impl InputLog {
 
     /// What the hands of all users add to the cost of a tick that is stepped again, as a number of
     /// steps without hands: of each body, the square of its hands.
-    pub(crate) fn crowd(&self) -> u64 {
+    pub(crate) fn cost_of_hands(&self) -> u64 {
         let mut hands: BTreeMap<BodyId, u64> = BTreeMap::new();
         let present = self.users.values().filter(|u| !u.gone);
         for held in present.filter_map(UserInputs::newest).flat_map(|input| &input.held) {
             *hands.entry(held.body).or_default() += 1;
         }
-        let cost = |hands: u64| hands.min(MAX_HANDS as u64).pow(2) / CROWD;
+        let cost = |hands: u64| hands.min(MAX_HANDS as u64).pow(2) / SQUARED_HANDS_PER_STEP;
         hands.into_values().map(cost).sum()
     }
 

@@ -3,7 +3,7 @@
 mod grabs;
 mod introductions;
 mod joining;
-mod pace;
+mod pacing;
 mod repair;
 mod shapes;
 mod states;
@@ -15,7 +15,7 @@ use std::time::Duration;
 use pliant_modal::{ModalModel, StepSettings};
 
 use introductions::Introductions;
-use pace::BEHIND;
+use pacing::BEHIND;
 use repair::affords;
 
 use super::body::PeerBody;
@@ -74,9 +74,9 @@ pub struct PeerSession {
     /// Ticks that a stall has cost, or a jump of the own clock. The others may hurry this peer by
     /// no more than these.
     missed: u64,
-    /// Ticks by which the others have hurried this peer of late. If they turn out to be behind, it
+    /// Ticks that this peer has lately caught up to the others. If they turn out to be behind, it
     /// waits as many.
-    hurried: u64,
+    caught_up: u64,
     rollback_from: Option<Tick>,
     /// The tick of the last state taken. Rollback never goes to an earlier tick.
     taken: Tick,
@@ -136,7 +136,7 @@ impl PeerSession {
             next_step: None,
             catches_up: false,
             missed: 0,
-            hurried: 0,
+            caught_up: 0,
             rollback_from: None,
             taken: 0,
             out: VecDeque::new(),
@@ -388,20 +388,20 @@ impl PeerSession {
         if !self.started {
             return 0;
         }
-        self.tell_others(now);
+        self.send_introductions(now);
         self.roll_back();
         let mut stepped = 0;
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
         let mut due = due;
         while due <= now && stepped < STEPS {
-            if self.hurried > 0 && self.lead().1 > BEHIND {
-                self.hurried -= 1;
+            if self.caught_up > 0 && self.lead().1 > BEHIND {
+                self.caught_up -= 1;
                 due += Duration::from_secs_f64(self.config.step);
                 continue;
             }
             self.step();
             stepped += 1;
-            self.hurried = self.hurried.saturating_sub(1);
+            self.caught_up = self.caught_up.saturating_sub(1);
             due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
             if stepped == STEPS && due <= now {
                 // The clock does not tell a stall from a jump of its own. What the others tell of
@@ -496,6 +496,13 @@ impl PeerSession {
         if let Some(other) = self.others.get_mut(&peer) {
             other.link.send_message(message.encode(), &mut self.out);
         }
+    }
+
+    /// Sends a message to all peers in the session.
+    fn broadcast(&mut self, message: &PeerMessage) {
+        let joined = self.others.iter().filter(|(_, other)| other.user.is_some());
+        let peers: Vec<PeerId> = joined.map(|(&peer, _)| peer).collect();
+        peers.into_iter().for_each(|peer| self.message(peer, message));
     }
 
     fn event(&mut self, event: PeerEvent) {

@@ -148,8 +148,8 @@ mod tests {
         }
         assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "no hitch");
         guard.pass(2300 * MS, Duration::ZERO);
-        let told = Vector3::from(guard.bound([0.0, 30.0, 0.0])).norm();
-        assert!((told - 9.6).abs() < 1e-9, "{told}");
+        let bounded = Vector3::from(guard.bound([0.0, 30.0, 0.0])).norm();
+        assert!((bounded - 9.6).abs() < 1e-9, "{bounded}");
         assert_eq!(guard.bound([0.0, 3.0, 0.0]), [0.0, 3.0, 0.0]);
         (0..=50).for_each(|k| guard.pass((2300 + 20 * k) * MS, Duration::ZERO));
         assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "a second later");
@@ -208,18 +208,18 @@ mod tests {
     fn a_reaction_that_is_not_known_fades_and_returns_slowly() {
         let mut guard = HitchGuard::new(0.025);
         guard.give(1, 10.0);
-        let told = |guard: &HitchGuard| guard.bound([10.0, 0.0, 0.0])[0];
+        let bounded = |guard: &HitchGuard| guard.bound([10.0, 0.0, 0.0])[0];
         let mut last = 10.0;
         for k in 0..=70 {
             guard.pass(10 * k * MS, 10 * k * MS);
-            let now = told(&guard);
+            let now = bounded(&guard);
             assert!(now <= last && (k > 10 || now == 10.0), "{now} after {k}0 ms");
             last = now;
         }
         assert!(last < 0.1, "{last} after 0.7 s");
         for k in 71..=100 {
             guard.pass(10 * k * MS, Duration::ZERO);
-            let now = told(&guard);
+            let now = bounded(&guard);
             assert!(now - last <= 0.4 + 1e-9, "from {last} to {now} in 10 ms");
             last = now;
         }

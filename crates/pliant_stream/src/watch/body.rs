@@ -91,8 +91,8 @@ pub struct BodyEncoder {
     past: Vec<Past>,
     scratch: Vec<i32>,
     group: Option<Group>,
-    /// The body sleeps, and watchers know.
-    told_rest: bool,
+    /// Whether the last frame says that the body rests.
+    sent_rest: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -125,7 +125,7 @@ impl BodyEncoder {
             past: Vec::new(),
             scratch: Vec::new(),
             group: None,
-            told_rest: false,
+            sent_rest: false,
         })
     }
 
@@ -142,7 +142,7 @@ impl BodyEncoder {
     /// Begins a new group with the next frame.
     pub fn restart(&mut self) {
         self.group = None;
-        self.told_rest = false;
+        self.sent_rest = false;
     }
 
     /// The frame of a tick. `None` for a tick without a frame: between two frames, and while the
@@ -157,7 +157,7 @@ impl BodyEncoder {
         {
             return Err(StreamError::TickOrder { last: group.last, found: state.tick });
         }
-        if !state.tick.is_multiple_of(self.every) || (state.resting && self.told_rest) {
+        if !state.tick.is_multiple_of(self.every) || (state.resting && self.sent_rest) {
             return Ok(None);
         }
         let pose = if self.free { state.pose } else { None };
@@ -165,7 +165,7 @@ impl BodyEncoder {
         if !in_range(shown) || pose.is_some_and(|pose| !pose.is_valid()) || state.tick >= TICK_LIMIT {
             return Err(StreamError::NotFinite { what: "watched state" });
         }
-        self.told_rest = state.resting;
+        self.sent_rest = state.resting;
         let count = self.places.len() + if pose.is_some() { POSE_VALUES } else { 0 };
         let goes_on = self.group.filter(|group| {
             state.tick - group.began < self.group_ticks

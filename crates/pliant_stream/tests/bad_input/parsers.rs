@@ -153,19 +153,19 @@ fn obstacles_and_contacts_that_are_none_are_refused() {
 
 #[test]
 fn shapes_of_held_patches_that_are_none_are_refused() {
-    let told = |from, places: Vec<HeldPlace>| {
+    let shapes = |from, places: Vec<HeldPlace>| {
         PeerMessage::decode(&PeerMessage::Shapes { body: 1, from, places }.encode())
     };
-    told(0, places(1)).unwrap();
-    told(1 << 40, places(4)).unwrap();
+    shapes(0, places(1)).unwrap();
+    shapes(1 << 40, places(4)).unwrap();
     let one = places(1)[0];
     let [x, y, z] = [f64::NAN, f64::INFINITY, 1e300].map(|bad| HeldPlace { way: [0.0, bad, 0.0], ..one });
     let [r, s] = [f64::NAN, -1.0].map(|radius| HeldPlace { radius, ..one });
     for bad in [x, y, z, r, s] {
-        assert!(told(5, vec![bad]).is_err(), "{bad:?}");
+        assert!(shapes(5, vec![bad]).is_err(), "{bad:?}");
     }
-    assert!(told(5, Vec::new()).is_err() && told(5, places(5)).is_err());
-    assert!(told(1 << 48, places(1)).is_err());
+    assert!(shapes(5, Vec::new()).is_err() && shapes(5, places(5)).is_err());
+    assert!(shapes(1 << 48, places(1)).is_err());
 
     let state = |shapes: Vec<PeerShapes>, s: Vec<f64>| {
         let zero = || vec![0.0; 4];

@@ -146,8 +146,8 @@ fn a_guest_that_breaks_the_protocol_is_shown_out_with_a_reason() {
     }
     assert!(ended);
     let goodbye = host.poll_output().unwrap();
-    let said = HostMessage::decode(&goodbye.bytes).unwrap();
-    assert_eq!(said, HostMessage::Goodbye { reason: DisconnectReason::Protocol });
+    let message = HostMessage::decode(&goodbye.bytes).unwrap();
+    assert_eq!(message, HostMessage::Goodbye { reason: DisconnectReason::Protocol });
 }
 
 #[test]
@@ -193,8 +193,8 @@ fn another_version_is_told_so() {
         cached: Vec::new(),
     };
     host.on_message(Duration::ZERO, PeerId(1), &hello.encode());
-    let said = HostMessage::decode(&host.poll_output().unwrap().bytes).unwrap();
-    assert_eq!(said, HostMessage::Goodbye { reason: DisconnectReason::VersionMismatch });
+    let message = HostMessage::decode(&host.poll_output().unwrap().bytes).unwrap();
+    assert_eq!(message, HostMessage::Goodbye { reason: DisconnectReason::VersionMismatch });
 }
 
 #[test]

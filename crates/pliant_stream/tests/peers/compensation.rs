@@ -45,7 +45,7 @@ fn compensation_corrects_every_tick_of_the_history() {
         let model = if free { loose_bar(24, 0.05) } else { bar(24, 0.05) };
         p.add_body(BODY, model, &StepSettings::default()).unwrap();
         greeted(&mut p);
-        let said = |p: &mut PeerSession, tick: u64, aside: f64, sequence: u16| {
+        let send = |p: &mut PeerSession, tick: u64, aside: f64, sequence: u16| {
             let target = [1.0, 0.18 + aside, 0.08];
             let (body, grab, vertex, radius, hold) = (BODY, 0, 66, 0.05, GrabConfig::default());
             let held = vec![HeldAt { body, grab, vertex, radius, target, hold }];
@@ -57,7 +57,7 @@ fn compensation_corrects_every_tick_of_the_history() {
         while p.tick() < LAST {
             let next = p.tick() + 1;
             if next != LATE {
-                said(&mut p, next, 0.0, next as u16);
+                send(&mut p, next, 0.0, next as u16);
             }
             p.update(25 * MS * next as u32 + MS);
         }
@@ -65,7 +65,7 @@ fn compensation_corrects_every_tick_of_the_history() {
             (1..=LAST).map(|tick| p.state_at(BODY, tick).unwrap().clone()).collect()
         };
         let before = history(&p);
-        said(&mut p, LATE, 0.02, LATE as u16);
+        send(&mut p, LATE, 0.02, LATE as u16);
         assert_eq!(p.update(25 * MS * LAST as u32 + MS), 0, "no step");
         let after = history(&p);
         let body = p.body(BODY).unwrap();

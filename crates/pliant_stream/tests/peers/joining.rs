@@ -21,8 +21,8 @@ fn lone(user: UserId, founds: bool) -> PeerSession {
 
 /// Delivers the messages of `from`, which `to` knows as `peer`. Returns their number.
 fn tell(from: &mut PeerSession, to: &mut PeerSession, peer: PeerId) -> usize {
-    let said = std::iter::from_fn(|| from.poll_output()).filter(|out| out.channel == Channel::Message);
-    said.map(|out| to.on_message(100 * MS, peer, &out.bytes)).count()
+    let messages = std::iter::from_fn(|| from.poll_output()).filter(|out| out.channel == Channel::Message);
+    messages.map(|out| to.on_message(100 * MS, peer, &out.bytes)).count()
 }
 
 #[test]

@@ -167,8 +167,8 @@ fn the_lowest_number_is_believed_when_it_was_asked() {
     let p = mesh.peers[1].as_mut().unwrap();
     for s in 0..3_u16 {
         let check = Some(StateCheck { body: BODY, tick: p.confirmed(), value: 1e6 });
-        let said = Datagram::Inputs(Inputs { now: p.tick(), ahead: None, ticks: Vec::new(), check });
-        p.on_datagram(mesh.now, PeerId(0), &said.encode(s));
+        let inputs = Datagram::Inputs(Inputs { now: p.tick(), ahead: None, ticks: Vec::new(), check });
+        p.on_datagram(mesh.now, PeerId(0), &inputs.encode(s));
     }
     mesh.run(8 * S);
     let resynced = |e: &&(usize, PeerEvent)| e.1 == PeerEvent::Resynced { from: UserId(1) };

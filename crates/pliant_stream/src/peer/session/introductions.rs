@@ -1,6 +1,6 @@
-//! Introductions: a peer tells the others with whom it is connected.
+//! Introductions: a peer sends the others the list of those with whom it is connected.
 //!
-//! Two peers may lose each other while one of them comes back through a third, which is told of
+//! Two peers may lose each other while one of them reconnects through a third peer, which learns of
 //! neither loss. Without its introduction the mesh would stay incomplete.
 
 use std::time::Duration;
@@ -11,10 +11,10 @@ use crate::StreamError;
 /// Shortest time between two lists that are sent.
 const INTRODUCTION_INTERVAL: Duration = Duration::from_secs(2);
 /// Shortest time between two lists of one peer that are read. Messages may arrive in a bunch, but
-/// what a list tells is told again by the next one.
+/// what a list has is in the next one, too.
 const READ_EVERY: Duration = Duration::from_millis(500);
 
-/// What this peer tells of the others.
+/// What this peer sends of the others.
 #[derive(Debug, Default)]
 pub(super) struct Introductions {
     list: Vec<(u16, String)>,
@@ -25,17 +25,17 @@ pub(super) struct Introductions {
 }
 
 impl Introductions {
-    /// Takes somebody who has left off the list. Of whoever comes back all are told again, also
-    /// where the app learns of both in one look and its list stays the same.
+    /// Removes a user who has left from the list. The list is then sent again when the user comes
+    /// back, even if the app notices both at once and its own list stays the same.
     pub(super) fn forget(&mut self, user: UserId) {
         self.list.retain(|(known, _)| *known != user.0);
     }
 }
 
 impl PeerSession {
-    /// Sets with whom this peer is connected, as user numbers and addresses, at most 64. When
-    /// somebody has come, or come back, all peers in the session are told, at most every two
-    /// seconds. Those who have lost one of them get [`PeerEvent::Introduced`].
+    /// Sets with whom this peer is connected, as user numbers and addresses, at most 64. When the
+    /// list has a user that it had not, all peers in the session receive it, at most every two
+    /// seconds. Those that lack one of its users get [`PeerEvent::Introduced`].
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for an address of more than 512 bytes.
@@ -52,16 +52,15 @@ impl PeerSession {
         Ok(())
     }
 
-    pub(super) fn tell_others(&mut self, now: Duration) {
+    /// Sends the list if it is due.
+    pub(super) fn send_introductions(&mut self, now: Duration) {
         let known = &mut self.introductions;
         if !known.is_new || now < known.next {
             return;
         }
         (known.is_new, known.next) = (false, now + INTRODUCTION_INTERVAL);
         let message = PeerMessage::Others { others: known.list.clone() };
-        let present: Vec<PeerId> =
-            self.others.iter().filter(|(_, other)| other.user.is_some()).map(|(&peer, _)| peer).collect();
-        present.into_iter().for_each(|peer| self.message(peer, &message));
+        self.broadcast(&message);
     }
 
     pub(super) fn take_others(&mut self, now: Duration, peer: PeerId, others: Vec<(u16, String)>) {

@@ -125,5 +125,5 @@ pub(super) fn late_cost(
     let touches = bodies.values().any(PeerBody::touches);
     let done = input.held.len() + input.impulses.len();
     let own = 1 + done as u64 + if touches { CONTACT_COST } else { 0 };
-    [own, inputs.crowd()].map(|cost| (ticks * cost) as f64)
+    [own, inputs.cost_of_hands()].map(|cost| (ticks * cost) as f64)
 }

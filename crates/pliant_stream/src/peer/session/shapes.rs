@@ -10,7 +10,7 @@ use std::time::Duration;
 use pliant_modal::{HeldPlace, HeldShapes};
 
 use super::repair::late_cost;
-use super::{BodyId, PeerId, PeerMessage, PeerSession, RemotePeer, Tick, UserId, WINDOW};
+use super::{BodyId, PeerId, PeerMessage, PeerSession, Tick, UserId, WINDOW};
 use crate::link::Budget;
 use crate::peer::columns::fit;
 use crate::wire::InputTick;
@@ -110,7 +110,7 @@ impl PeerSession {
             return;
         }
         body.columns.expect(places.clone());
-        self.tell(&PeerMessage::Shapes { body: id.0, from: 0, places });
+        self.broadcast(&PeerMessage::Shapes { body: id.0, from: 0, places });
     }
 
     /// Says from which tick shapes count that this peer has made.
@@ -119,16 +119,10 @@ impl PeerSession {
         let from = self.tick + ahead;
         let Some(body) = self.bodies.get_mut(&id) else { return };
         if body.columns.add(from, places.to_vec()) {
-            self.tell(&PeerMessage::Shapes { body: id.0, from, places: places.to_vec() });
+            self.broadcast(&PeerMessage::Shapes { body: id.0, from, places: places.to_vec() });
         } else {
             body.columns.expect_none();
         }
-    }
-
-    fn tell(&mut self, message: &PeerMessage) {
-        let known = |other: &RemotePeer| other.user.is_some();
-        let peers: Vec<PeerId> = self.others.iter().filter(|(_, o)| known(o)).map(|(p, _)| *p).collect();
-        peers.into_iter().for_each(|peer| self.message(peer, message));
     }
 
     /// Takes what another peer says of shapes. Only one with a lower number is believed, and

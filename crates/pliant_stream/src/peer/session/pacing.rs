@@ -1,4 +1,4 @@
-//! How fast this peer steps, to stay with the others.
+//! Pacing: how fast this peer steps, to stay with the others.
 
 use super::PeerSession;
 
@@ -8,8 +8,8 @@ const SLEW: f64 = 0.01;
 pub(super) const BEHIND: u64 = 8;
 
 impl PeerSession {
-    /// By how many ticks every other peer is ahead of this one, and by how many behind, as far as
-    /// they have told.
+    /// By how many ticks every other peer is at least ahead of this one, and by how many behind,
+    /// judged by the newest tick received from each.
     pub(super) fn lead(&self) -> (u64, u64) {
         let others = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
         let both = others.map(|o| (o.newest.saturating_sub(self.tick), self.tick.saturating_sub(o.newest)));
@@ -27,7 +27,7 @@ impl PeerSession {
         let ticks = most.min(ahead).min(self.missed);
         (0..ticks).for_each(|_| self.step());
         self.missed -= ticks;
-        self.hurried += ticks;
+        self.caught_up += ticks;
         for ahead in self.others.values_mut().filter_map(|o| o.ahead.as_mut()) {
             *ahead += ticks as f64;
         }
