@@ -107,7 +107,7 @@ impl<T> Waiting<T> {
 
 /// One direction between the host and a guest.
 #[derive(Debug)]
-struct Way {
+struct Direction {
     reliable: EmulatedLink,
     /// Sent by an app whose network stands still.
     sent: Waiting<Vec<u8>>,
@@ -115,7 +115,7 @@ struct Way {
     received: Waiting<Vec<u8>>,
 }
 
-impl Way {
+impl Direction {
     fn new(link: &LinkConfig, seed: u64) -> Self {
         let reliable = EmulatedLink::new(reliable(link), seed);
         Self { reliable, sent: Waiting::default(), received: Waiting::default() }
@@ -184,8 +184,8 @@ pub struct GuestEnd {
     pub down: EmulatedLink,
     /// Link for datagrams, guest to host.
     pub up: EmulatedLink,
-    to_guest: Way,
-    to_host: Way,
+    to_guest: Direction,
+    to_host: Direction,
     connected: bool,
     /// What this guest has sent before it was cut off still arrives.
     lingers: bool,
@@ -353,8 +353,8 @@ impl Pair {
         session.connect(self.now)?;
         self.guests.push(GuestEnd {
             session,
-            to_guest: Way::new(&path.down, seed ^ 0x5157),
-            to_host: Way::new(&path.up, seed ^ 0x7515),
+            to_guest: Direction::new(&path.down, seed ^ 0x5157),
+            to_host: Direction::new(&path.up, seed ^ 0x7515),
             down: EmulatedLink::new(path.down, seed),
             up: EmulatedLink::new(path.up, seed ^ 0xFFFF_0000),
             connected: true,

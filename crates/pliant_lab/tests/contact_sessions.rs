@@ -104,8 +104,8 @@ struct Fall {
 }
 
 impl Fall {
-    /// `told` says whether guests are told what the bodies fall onto.
-    fn new(model: &Arc<ModalModel>, pile: &Pile, told: bool) -> (Pair, Self) {
+    /// `announced` says whether guests receive what the bodies fall onto.
+    fn new(model: &Arc<ModalModel>, pile: &Pile, announced: bool) -> (Pair, Self) {
         let bodies = pile.bodies(model).unwrap();
         let newmark = Newmark::average(1.0 / RATE);
         let mut pair = Pair::new(HostSessionConfig { newmark, ..Default::default() }).unwrap();
@@ -113,7 +113,7 @@ impl Fall {
             let settings = body.config().settings;
             let id = BodyId(index as u16);
             pair.host.add_body(id, "jack", model.clone(), settings).unwrap();
-            if !told {
+            if !announced {
                 continue;
             }
             let obstacles = body.contacts().obstacles().iter().filter_map(|obstacle| obstacle.fixed());
@@ -268,10 +268,10 @@ fn drag(body: BodyId, begin: Duration) -> Box<dyn FnMut(Duration, &mut GuestSess
 
 /// Runs a session of some bodies that fall, rest, and of which a guest drags the first over the
 /// floor from the twelfth second on. Prints what the guest shows.
-fn run(count: usize, told: bool) -> [Errors; 3] {
+fn run(count: usize, announced: bool) -> [Errors; 3] {
     let model = jack();
     let pile = Pile { count, rate: RATE, elasticity: Some(Elasticity::Linear), ..Pile::default() };
-    let (mut pair, mut fall) = Fall::new(&model, &pile, told);
+    let (mut pair, mut fall) = Fall::new(&model, &pile, announced);
     fall.hand = drag(BodyId(0), 12 * S);
     pair.join_with(GuestSessionConfig::default(), paper1(), 5, cached(&model)).unwrap();
     let mut before = [0; 2];
@@ -286,7 +286,7 @@ fn run(count: usize, told: bool) -> [Errors; 3] {
         (until, sent(&pair), fall.resting)
     });
     let rests = fall.truth[0].windows(2).position(|w| w[0] == w[1]);
-    println!("{count} bodies, told {told}; the pile rests after tick {rests:?}");
+    println!("{count} bodies, ground announced: {announced}; the pile rests after tick {rests:?}");
     for (until, bytes, resting) in bytes {
         println!("  until {until:?}: {bytes:?} bytes of datagrams and messages, resting {resting}");
     }
@@ -317,8 +317,8 @@ fn a_body_that_falls_and_is_dragged_is_shown_where_it_is() {
     assert!(falls.rms() < 0.002 && falls.largest < 0.03, "{falls:?}");
     assert!(dragged.rms() < 0.002 && dragged.largest < 0.03, "{dragged:?}");
     assert!(own.rms() < 0.02 && own.largest < 0.1, "{own:?}");
-    let untold = run(1, false).map(|errors| errors.rms());
-    assert!(falls.rms() < 0.1 * untold[0] && own.rms() < 0.1 * untold[2], "{untold:?}");
+    let unannounced = run(1, false).map(|errors| errors.rms());
+    assert!(falls.rms() < 0.1 * unannounced[0] && own.rms() < 0.1 * unannounced[2], "{unannounced:?}");
 }
 
 #[test]

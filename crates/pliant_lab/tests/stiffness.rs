@@ -9,7 +9,7 @@ use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
 
 /// The largest visual error from a second after the change on, as a share of the largest shape.
-fn after_a_change(told: bool, scale: f64) -> f64 {
+fn after_a_change(announced: bool, scale: f64) -> f64 {
     let model = bar(24, 0.05);
     let mut pair = pliant_lab::pair::Pair::new(HostSessionConfig::default()).unwrap();
     let settings = StepSettings::default();
@@ -24,7 +24,7 @@ fn after_a_change(told: bool, scale: f64) -> f64 {
         ..scene.body.config().clone()
     };
     scene.body.reconfigure(config).unwrap();
-    if told {
+    if announced {
         pair.host.set_settings(BODY, stiff).unwrap();
         // Setting the same settings again has no effect.
         pair.host.set_settings(BODY, stiff).unwrap();
@@ -32,9 +32,9 @@ fn after_a_change(told: bool, scale: f64) -> f64 {
     scene.settled = 6 * S;
     pair.run_until(12 * S, &mut scene);
     let changes = scene.guest_events.iter().filter(|e| matches!(e.1, GuestEvent::BodyChanged { body: BODY }));
-    assert_eq!(changes.count(), usize::from(told), "told once");
+    assert_eq!(changes.count(), usize::from(announced), "announced once");
     let view = pair.guests[0].session.body(BODY).unwrap();
-    assert_eq!(view.info().settings.stiffness_scale, if told { scale } else { 1.0 });
+    assert_eq!(view.info().settings.stiffness_scale, if announced { scale } else { 1.0 });
     assert!(view.predicted_hand().is_some(), "the guest's hand is still on it");
     assert_eq!(scene.grabs.len(), 1, "at the host too");
     assert!(!scene.saw(0, |e| matches!(e, GuestEvent::BodyGone { .. })));
@@ -45,10 +45,10 @@ fn after_a_change(told: bool, scale: f64) -> f64 {
 #[test]
 fn guests_follow_a_body_that_becomes_stiffer_or_softer_with_their_hands_on_it() {
     for scale in [4.0, 0.3] {
-        let (told, untold) = (after_a_change(true, scale), after_a_change(false, scale));
-        println!("{scale} times as stiff: {:.3} % told, {:.3} % untold", 100.0 * told, 100.0 * untold);
-        assert!(told < 0.05, "{scale}: {told}");
-        assert!(told < 0.7 * untold, "{scale}: {told} told, {untold} untold");
+        let (announced, silent) = (after_a_change(true, scale), after_a_change(false, scale));
+        println!("{scale} times as stiff: {:.3} % announced, {:.3} % not", 100.0 * announced, 100.0 * silent);
+        assert!(announced < 0.05, "{scale}: {announced}");
+        assert!(announced < 0.7 * silent, "{scale}: {announced} announced, {silent} not");
     }
 }
 

@@ -16,12 +16,12 @@ use crate::LabError;
 /// Steps and surfaces a second.
 const RATE: f64 = 60.0;
 
-/// A setting with its errors at each way and its times.
+/// A setting with its errors at each displacement and its times.
 struct Setting {
     words: String,
     /// Line of the figures: linear, reduced, reduced with the shapes of the patch.
     line: usize,
-    /// Errors of the force, as a share of it, and of the surface, m, at each way.
+    /// Errors of the force, as a share of it, and of the surface, m, at each displacement.
     errors: Vec<[f64; 2]>,
     /// Time for a second of motion, all steps and surfaces: median and 99th percentile, us.
     cost: [f64; 2],
@@ -33,14 +33,14 @@ struct Setting {
 
 const LINES: [&str; 3] = ["linear", "reduced", "reduced, with the patch's own shapes"];
 
-/// Leads a hand slowly along `way`, and returns the body at rest with the error of the force and
-/// the largest error of the surface.
-fn led(
+/// Leads a hand slowly along `displacement`, and returns the body at rest with the error of the
+/// force and the largest error of the surface.
+fn lead_hand(
     model: &Arc<ModalModel>,
     elasticity: Elasticity,
     has_shapes: bool,
     patch: &Patch,
-    way: [f64; 3],
+    displacement: [f64; 3],
     truth: &Deflection,
 ) -> Result<(Body, [f64; 2]), LabError> {
     let settings = StepSettings { elasticity, damping_scale: 10.0, ..StepSettings::default() };
@@ -52,7 +52,7 @@ fn led(
             body.make_held_shapes()?;
         }
         let s = crate::smooth(f64::from(i) / 600.0);
-        body.set_target(grab, std::array::from_fn(|k| start[k] + s * way[k]))?;
+        body.set_target(grab, std::array::from_fn(|k| start[k] + s * displacement[k]))?;
         body.step()?;
     }
     let rest = model.surface().positions();
@@ -79,8 +79,8 @@ fn setting(
     let (model, bake) = baked(mesh, baking)?;
     let elasticity = if line == 0 { Elasticity::Linear } else { Elasticity::Reduced };
     let (mut errors, mut cost) = (Vec::new(), [0.0f64; 2]);
-    for (patch, way, truth) in hands {
-        let (mut body, error) = led(&model, elasticity, line == 2, patch, *way, truth)?;
+    for (patch, displacement, truth) in hands {
+        let (mut body, error) = lead_hand(&model, elasticity, line == 2, patch, *displacement, truth)?;
         errors.push(error);
         let step = time_us(1_000, || Ok(body.step().map(|_| ())?))?;
         let mut positions = model.surface().positions().to_vec();
@@ -105,12 +105,12 @@ pub(super) fn elasticity(quick: bool) -> Result<(Vec<Figure>, String), LabError>
     let corner = farthest(&model, [1.0, 0.1, 0.1]);
     let patch = Patch::around(model.surface(), corner, 0.05)?;
     let mut hands = Vec::new();
-    let ways: &[f64] = &[0.02, 0.08, 0.28];
-    for way in ways {
-        let way = [0.0, way * 0.5f64.sqrt(), way * 0.5f64.sqrt()];
-        let prescribed = [PrescribedPatch { patch: patch.clone(), displacement: way }];
+    let shares: &[f64] = &[0.02, 0.08, 0.28];
+    for share in shares {
+        let displacement = [0.0, share * 0.5f64.sqrt(), share * 0.5f64.sqrt()];
+        let prescribed = [PrescribedPatch { patch: patch.clone(), displacement }];
         let loads = StaticLoads { prescribed: &prescribed, ..StaticLoads::default() };
-        hands.push((patch.clone(), way, deflect(&mesh, &reference, Material::NeoHookean, &loads)?));
+        hands.push((patch.clone(), displacement, deflect(&mesh, &reference, Material::NeoHookean, &loads)?));
     }
     let counts: [&[usize]; 2] = if quick { [&[20], &[20]] } else { [&[6, 20, 60], &[12, 20, 36]] };
     let mut settings = Vec::new();
@@ -123,10 +123,10 @@ pub(super) fn elasticity(quick: bool) -> Result<(Vec<Figure>, String), LabError>
     let figures = ["eye", "hand"].into_iter().zip([1, 0]).map(|(who, which)| {
         let mut series = Vec::new();
         for (line, name) in LINES.iter().enumerate() {
-            for (index, way) in ways.iter().enumerate() {
+            for (index, share) in shares.iter().enumerate() {
                 let own = settings.iter().filter(|setting| setting.line == line);
                 let points = own.map(|setting| (setting.cost[0], setting.errors[index][which])).collect();
-                let name = format!("{name}, led by {:.0} % of the length", 100.0 * way);
+                let name = format!("{name}, led by {:.0} % of the length", 100.0 * share);
                 series.push(Series::new(&name, points));
             }
         }

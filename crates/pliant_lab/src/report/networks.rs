@@ -27,7 +27,7 @@ const EQUAL: (u8, u8) = (1, 3);
 
 /// A way of repair.
 #[derive(Clone, Copy)]
-struct Way {
+struct RepairScheme {
     name: &'static str,
     recovery: RecoveryConfig,
     between_peers: Option<LateInputRepair>,
@@ -35,16 +35,19 @@ struct Way {
 
 /// The ways of repair, without the names that differ from another one only by playout delay and
 /// repeats.
-fn ways() -> Vec<Way> {
-    let way = |name, recovery| Way { name, recovery, between_peers: None };
-    let peers = |name, repair| Way { between_peers: Some(repair), ..way(name, RecoveryConfig::default()) };
+fn schemes() -> Vec<RepairScheme> {
+    let scheme = |name, recovery| RepairScheme { name, recovery, between_peers: None };
+    let peers = |name, repair| RepairScheme {
+        between_peers: Some(repair),
+        ..scheme(name, RecoveryConfig::default())
+    };
     vec![
-        way("default", RecoveryConfig::default()),
-        way("force-driven", RecoveryConfig::by_name("force-driven").unwrap_or_default()),
-        way("paper", RecoveryConfig::paper()),
-        way("paper-zero", RecoveryConfig::paper_with(Predict::Zero, 50)),
-        way("paper-hold", RecoveryConfig::paper_with(Predict::Hold, 50)),
-        way("none", RecoveryConfig::none()),
+        scheme("default", RecoveryConfig::default()),
+        scheme("force-driven", RecoveryConfig::by_name("force-driven").unwrap_or_default()),
+        scheme("paper", RecoveryConfig::paper()),
+        scheme("paper-zero", RecoveryConfig::paper_with(Predict::Zero, 50)),
+        scheme("paper-hold", RecoveryConfig::paper_with(Predict::Hold, 50)),
+        scheme("none", RecoveryConfig::none()),
         peers("peers, rollback", LateInputRepair::Rollback),
         peers("peers, compensate", LateInputRepair::Compensate),
     ]
@@ -73,12 +76,12 @@ fn paths() -> Vec<(&'static str, LinkConfig)> {
 /// A way of repair over a path with a playout delay (ticks) and repeats.
 fn experiment(
     model: &Arc<ModalModel>,
-    way: &Way,
+    scheme: &RepairScheme,
     link: &LinkConfig,
     (delay, repeats): (u8, u8),
     seconds: f64,
 ) -> Experiment {
-    let recovery = RecoveryConfig { playout: Playout::Fixed(delay), repeats, ..way.recovery };
+    let recovery = RecoveryConfig { playout: Playout::Fixed(delay), repeats, ..scheme.recovery };
     let mut made = Experiment::new(model.clone(), link.clone(), recovery);
     made.peer_repeats = repeats.into();
     // The paper's streams have the paper's integrator at both ends.
@@ -90,8 +93,8 @@ fn experiment(
     made
 }
 
-fn run(way: &Way, made: &Experiment) -> Result<Metrics, LabError> {
-    Ok(match way.between_peers {
+fn run(scheme: &RepairScheme, made: &Experiment) -> Result<Metrics, LabError> {
+    Ok(match scheme.between_peers {
         Some(repair) => made.run_peers(repair)?,
         None => made.run()?,
     })
@@ -99,20 +102,27 @@ fn run(way: &Way, made: &Experiment) -> Result<Metrics, LabError> {
 
 /// Runs an experiment several times for its processor time. The first run fills the caches, and the
 /// shortest of the others is the time of the work itself. All runs give the same metrics.
-fn timed(way: &Way, mut made: Experiment) -> Result<Metrics, LabError> {
+fn timed(scheme: &RepairScheme, mut made: Experiment) -> Result<Metrics, LabError> {
     made.cpu_clock = Some(machine::thread_time);
-    let mut f = run(way, &made)?;
+    let mut f = run(scheme, &made)?;
     f.cpu_us_per_tick = f64::INFINITY;
     for _ in 0..3 {
-        f.cpu_us_per_tick = f.cpu_us_per_tick.min(run(way, &made)?.cpu_us_per_tick);
+        f.cpu_us_per_tick = f.cpu_us_per_tick.min(run(scheme, &made)?.cpu_us_per_tick);
     }
     Ok(f)
 }
 
 const COLUMNS: &str = "| network | repair | playout ticks, repeats | rms % | rms / rms of the motion % | largest % | ticks missing | force, rms / rms of the force % | without tremor: force % | shown delay ms | kbit/s | processor us a tick |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n";
 
-fn row(out: &mut String, path: &str, way: &Way, (delay, repeats): (u8, u8), f: &Metrics, calm: &Metrics) {
-    let settings = match way.between_peers {
+fn row(
+    out: &mut String,
+    path: &str,
+    scheme: &RepairScheme,
+    (delay, repeats): (u8, u8),
+    f: &Metrics,
+    calm: &Metrics,
+) {
+    let settings = match scheme.between_peers {
         Some(_) => format!("0, {repeats}"),
         None => format!("{delay}, {repeats}"),
     };
@@ -120,7 +130,7 @@ fn row(out: &mut String, path: &str, way: &Way, (delay, repeats): (u8, u8), f: &
     let _ = writeln!(
         out,
         "| {path} | {} | {settings} | {:.4} | {:.4} | {:.2} | {} | {:.4} | {:.4} | {:.0} | {:.1} | {:.1} |",
-        way.name,
+        scheme.name,
         f.rms_percent,
         f.rms_of_motion_percent,
         f.max_percent,
@@ -141,9 +151,9 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
     // own clock leaves out other load on the machine.
     let _pinned = Pinned::new();
     let seconds = if quick { 20.0 } else { 60.0 };
-    let (ways, paths) = (ways(), paths());
+    let (schemes, paths) = (schemes(), paths());
     let (mut equal, mut best) = (COLUMNS.to_owned(), COLUMNS.to_owned());
-    let mut points = vec![[Vec::new(), Vec::new()]; ways.len()];
+    let mut points = vec![[Vec::new(), Vec::new()]; schemes.len()];
     let without_tremor = |mut made: Experiment| {
         made.hands.iter_mut().for_each(|hand| hand.tremor = 0.0);
         made
@@ -151,12 +161,14 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
     let (delays, repeats): (&[u8], &[u8]) =
         if quick { (&[1, 4], &[3]) } else { (&[0, 1, 2, 4], &[0, 1, 3, 7]) };
     for (done, (path, link)) in paths.iter().enumerate() {
-        for (index, way) in ways.iter().enumerate() {
-            progress
-                .report("network", (done * ways.len() + index) as f64 / (paths.len() * ways.len()) as f64);
-            let made = |settings| experiment(&model, way, link, settings, seconds);
-            let f = timed(way, made(EQUAL))?;
-            row(&mut equal, path, way, EQUAL, &f, &run(way, &without_tremor(made(EQUAL)))?);
+        for (index, scheme) in schemes.iter().enumerate() {
+            progress.report(
+                "network",
+                (done * schemes.len() + index) as f64 / (paths.len() * schemes.len()) as f64,
+            );
+            let made = |settings| experiment(&model, scheme, link, settings, seconds);
+            let f = timed(scheme, made(EQUAL))?;
+            row(&mut equal, path, scheme, EQUAL, &f, &run(scheme, &without_tremor(made(EQUAL)))?);
             // The first four paths are the paper's networks, which are drawn.
             if done < 4 {
                 let error = f.rms_of_motion_percent.max(1e-5);
@@ -164,18 +176,18 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
                 points[index][1].push((f.cpu_us_per_tick, error));
             }
             let mut least = (f64::INFINITY, EQUAL);
-            let own_delay = if way.between_peers.is_some() { &delays[..1] } else { delays };
+            let own_delay = if scheme.between_peers.is_some() { &delays[..1] } else { delays };
             for &delay in own_delay {
                 for &repeats in repeats {
-                    let error = run(way, &made((delay, repeats)))?.rms_of_motion_percent;
+                    let error = run(scheme, &made((delay, repeats)))?.rms_of_motion_percent;
                     // A longer delay or more repeats have to gain at least a hundredth.
                     if error < 0.99 * least.0 {
                         least = (error, (delay, repeats));
                     }
                 }
             }
-            let f = timed(way, made(least.1))?;
-            row(&mut best, path, way, least.1, &f, &run(way, &without_tremor(made(least.1)))?);
+            let f = timed(scheme, made(least.1))?;
+            row(&mut best, path, scheme, least.1, &f, &run(scheme, &without_tremor(made(least.1)))?);
         }
     }
     let text = format!(
@@ -199,7 +211,11 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
         x: x.into(),
         y: "shown error, rms, % of the rms of the motion".into(),
         logarithmic: true,
-        series: ways.iter().zip(&points).map(|(way, p)| Series::new(way.name, p[which].clone())).collect(),
+        series: schemes
+            .iter()
+            .zip(&points)
+            .map(|(scheme, p)| Series::new(scheme.name, p[which].clone()))
+            .collect(),
         reference_error: None,
         words: words.into(),
     });

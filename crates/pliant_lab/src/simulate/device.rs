@@ -18,7 +18,7 @@ const ROUNDING: f64 = 1.0 + 1e-6;
 
 /// What the devices of a session have done.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Felt {
+pub(super) struct DeviceRecord {
     /// Periods of the loops.
     pub(super) periods: u64,
     /// Largest force, N.
@@ -27,7 +27,7 @@ pub(super) struct Felt {
     pub(super) rise: f64,
 }
 
-impl Felt {
+impl DeviceRecord {
     pub(super) fn add(&mut self, other: Self) {
         self.periods += other.periods;
         (self.force, self.rise) = (self.force.max(other.force), self.rise.max(other.rise));
@@ -87,10 +87,10 @@ impl DeviceLoop {
         if report.ticks == 0 { hand } else { report.tick.tool }
     }
 
-    /// The app publishes what a hand is told of: where it was, and the reaction. Without it, the
+    /// The app publishes what is displayed to a hand: its target and the reaction. Without it, the
     /// tool holds nothing that is known.
-    pub(super) fn publish(&mut self, told: Option<([f64; 3], [f64; 3])>, step: f64) {
-        let grab = told.map(|(target, reaction)| PublishedGrab {
+    pub(super) fn publish(&mut self, displayed: Option<([f64; 3], [f64; 3])>, step: f64) {
+        let grab = displayed.map(|(target, reaction)| PublishedGrab {
             key: 1,
             point: std::array::from_fn(|i| target[i] + reaction[i] / SPRING),
             force: reaction,
@@ -108,8 +108,8 @@ impl DeviceLoop {
         model: &ModalModel,
         until: Duration,
         [stalled, gone]: [bool; 2],
-    ) -> Result<Felt, String> {
-        let mut felt = Felt::default();
+    ) -> Result<DeviceRecord, String> {
+        let mut record = DeviceRecord::default();
         self.handle.set_gone(gone);
         while self.at + PERIOD <= until {
             self.at += PERIOD;
@@ -133,8 +133,8 @@ impl DeviceLoop {
                     tick.silent
                 ));
             }
-            felt.add(Felt { periods: 1, force, rise: rise / most_rise });
+            record.add(DeviceRecord { periods: 1, force, rise: rise / most_rise });
         }
-        Ok(felt)
+        Ok(record)
     }
 }

@@ -11,7 +11,7 @@ use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
 use pliant_stream::{BodyId, Channel, PeerId, StepSettings, UserId};
 
-use super::device::{DeviceLoop, Felt};
+use super::device::{DeviceLoop, DeviceRecord};
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::{Processes, network};
@@ -83,7 +83,7 @@ struct Mesh {
     random: Random,
     now: Duration,
     ticks: u64,
-    felt: Felt,
+    device_record: DeviceRecord,
     digest: Digest,
     broken: Option<String>,
 }
@@ -116,7 +116,7 @@ pub(super) fn run(
         random: Random::new(!seed ^ random.next()),
         now: Duration::ZERO,
         ticks: 0,
-        felt: Felt::default(),
+        device_record: DeviceRecord::default(),
         digest: Digest::EMPTY,
         broken: None,
     };
@@ -171,7 +171,7 @@ pub(super) fn run(
     Ok(Outcome {
         ticks: mesh.ticks,
         share: 0.0,
-        felt: mesh.felt,
+        device_record: mesh.device_record,
         took: mesh.processes.took(),
         digest: mesh.digest,
         memory: [memory.largest, held],

@@ -45,7 +45,7 @@ const IDLE: Duration = Duration::from_secs(3);
 const LOOK: Duration = Duration::from_millis(5);
 /// The spring of an honest hand, N/m.
 const SPRING: f64 = 50.0;
-/// Largest force that an honest hand may be told of, N. It is the limit of a guest's hands by
+/// Largest force that may be displayed to an honest hand, N. It is the limit of a guest's hands by
 /// default.
 const MAX_FORCE: f64 = 1000.0;
 /// Largest difference after the end of all faults, as a share of the largest shape.
@@ -99,7 +99,8 @@ pub struct SimulateReport {
     pub digest: u64,
     /// Largest memory of a session at any time, and at its end, bytes; 0 where it is not measured.
     pub largest_memory: [i64; 2],
-    /// Largest reaction that a guest's hand was told of, over the largest true one of its session.
+    /// Largest reaction that was displayed to a guest's hand, over the largest true one of its
+    /// session.
     pub largest_share: f64,
     /// Periods of all loops of devices.
     pub device_periods: u64,
@@ -119,7 +120,7 @@ pub struct SimulateReport {
 struct Outcome {
     ticks: u64,
     share: f64,
-    felt: device::Felt,
+    device_record: device::DeviceRecord,
     took: Vec<FaultKind>,
     digest: Digest,
     memory: [i64; 2],
@@ -178,7 +179,7 @@ pub fn simulate(
     let model = body()?;
     let mut report = SimulateReport { seeds: settings.seeds, ..SimulateReport::default() };
     let mut digest = Digest::EMPTY;
-    let mut felt = device::Felt::default();
+    let mut device_record = device::DeviceRecord::default();
     // In chunks, so that progress can be reported.
     let end = settings.from.saturating_add(settings.seeds);
     let mut next = settings.from;
@@ -199,7 +200,7 @@ pub fn simulate(
                         *largest = memory.max(*largest);
                     }
                     report.ticks += outcome.ticks;
-                    felt.add(outcome.felt);
+                    device_record.add(outcome.device_record);
                     report.largest_share = report.largest_share.max(outcome.share);
                 }
                 Err(what) => {
@@ -213,8 +214,8 @@ pub fn simulate(
     }
     report.seconds = began.elapsed().as_secs_f64();
     report.digest = digest.0;
-    report.device_periods = felt.periods;
-    (report.largest_force, report.largest_rise) = (felt.force, felt.rise);
+    report.device_periods = device_record.periods;
+    (report.largest_force, report.largest_rise) = (device_record.force, device_record.rise);
     Ok(report)
 }
 

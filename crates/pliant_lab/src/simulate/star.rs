@@ -13,7 +13,7 @@ use pliant_stream::{
     UserId,
 };
 
-use super::device::{DeviceLoop, Felt};
+use super::device::{DeviceLoop, DeviceRecord};
 use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::Processes;
@@ -26,7 +26,7 @@ use crate::pair::{Pair, PathConfig, Stalled, World};
 const BODY: BodyId = BodyId(1);
 /// A host plays hands back two ticks late, and leads them by no more than this in a tick, m.
 const PLAYOUT: (usize, f64) = (2, 20.0 / 40.0);
-/// How long a hand has held when what it is told of is compared with the truth.
+/// How long a hand has held when the reaction displayed to it is compared with the truth.
 const SETTLED: Duration = Duration::from_secs(3);
 /// The grabs that a flood begins and ends.
 const FLOOD_GRABS: std::ops::Range<u16> = 100..104;
@@ -34,7 +34,7 @@ const FLOOD_GRABS: std::ops::Range<u16> = 100..104;
 const AHEAD: u64 = 4;
 /// Ticks of the host that are kept to compare with.
 const KEPT: usize = 400;
-/// Largest reaction told over the largest true one, also with a malicious guest: a fifth beyond it,
+/// Largest displayed reaction over the largest true one, also with a malicious guest: a fifth beyond it,
 /// and the rounding of the frames.
 const MAX_SHARE: f64 = 1.2 + 1e-3;
 
@@ -59,7 +59,7 @@ struct Apps {
     largest: Vec<(f64, f64)>,
     /// The devices of the guests' processes.
     devices: Vec<Option<DeviceLoop>>,
-    felt: Felt,
+    device_record: DeviceRecord,
     /// The processes whose apps have just written a file.
     wrote: Vec<usize>,
     mischief: Mischief,
@@ -222,7 +222,7 @@ impl World for Apps {
             let force = norm(shown);
             self.digest.add_all(&shown);
             let fair = force <= MAX_FORCE || process == self.malicious();
-            self.ensure(fair, || format!("{} is told of {force} N", name(process)));
+            self.ensure(fair, || format!("{} displays {force} N", name(process)));
             // A hand that has only just taken hold is ahead of what the host has made of it.
             if self.now > self.guests[guest].2.saturating_add(SETTLED) {
                 self.largest[process].0 = self.largest[process].0.max(force);
@@ -232,8 +232,8 @@ impl World for Apps {
         if let Some(device) = &mut self.devices[process] {
             let shown = grab.map(|grab| GrabKey { user, grab });
             let shown = view.grabs().iter().find(|grab| Some(grab.key) == shown);
-            let told = shown.and_then(|own| Some((own.target, view.hand_reaction(user, own.key.grab)?)));
-            device.publish(told, session.step());
+            let displayed = shown.and_then(|own| Some((own.target, view.hand_reaction(user, own.key.grab)?)));
+            device.publish(displayed, session.step());
             target = device.tool(target);
         }
         match grab {
@@ -305,7 +305,7 @@ pub(super) fn run(
         guests: Vec::new(),
         largest: vec![(0.0, 0.0); count],
         devices: std::iter::repeat_with(|| None).take(count).collect(),
-        felt: Felt::default(),
+        device_record: DeviceRecord::default(),
         wrote: Vec::new(),
         mischief: Mischief::default(),
         random: Random::new(!seed),
@@ -356,12 +356,12 @@ pub(super) fn run(
     let shares = star.apps.largest[1..count - 1].iter().map(|(shown, truth)| shown / truth.max(1e-9));
     let share = shares.fold(0.0, f64::max);
     if share > MAX_SHARE {
-        return Err(format!("a hand was told of {share:.3} times the largest true reaction"));
+        return Err(format!("a hand was displayed {share:.3} times the largest true reaction"));
     }
     Ok(Outcome {
         ticks: star.apps.ticks,
         share,
-        felt: star.apps.felt,
+        device_record: star.apps.device_record,
         took: star.processes.took(),
         digest: star.apps.digest,
         memory: [memory.largest, held],
@@ -457,7 +457,7 @@ impl Star {
             Some(device) => device,
             none => none.insert(DeviceLoop::new(&apps.model, process, now)?),
         };
-        apps.felt.add(device.run(&apps.model, now, self.processes.take_device(process, now))?);
+        apps.device_record.add(device.run(&apps.model, now, self.processes.take_device(process, now))?);
         Ok(())
     }
 

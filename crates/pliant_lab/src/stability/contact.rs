@@ -49,7 +49,9 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         Nonsense::Normal,
         Nonsense::Velocity,
     ] {
-        out.push(Case::new(group, format!("an obstacle tells {}", nonsense.name()), move || told(nonsense)));
+        out.push(Case::new(group, format!("an obstacle tells {}", nonsense.name()), move || {
+            obstacle_of(nonsense)
+        }));
     }
 }
 
@@ -271,7 +273,7 @@ impl ObstacleShape for Nonsense {
 }
 
 /// Each step in which the obstacle is asked is refused by name, and nothing moves in it.
-fn told(nonsense: Nonsense) -> Result<CaseOutcome, LabError> {
+fn obstacle_of(nonsense: Nonsense) -> Result<CaseOutcome, LabError> {
     let model = block(1e5, 0.1, Elasticity::Linear).bake()?;
     let mut body = body(&model, Elasticity::Linear, 60.0)?;
     let (sin, cos) = (0.5 * FRAC_PI_4).sin_cos();

@@ -156,7 +156,7 @@ fn full(
 }
 
 /// The force of the body on a hand, N, when it is at rest.
-fn felt(
+fn static_reaction(
     at: [f64; 3],
     model: &Arc<ModalModel>,
     elasticity: Elasticity,
@@ -172,7 +172,7 @@ fn off(got: Vector3<f64>, want: Vector3<f64>, limit: f64) -> CaseOutcome {
 
 fn same_mesh(form: Form, config: &BakeConfig, held: HandPull) -> Result<CaseOutcome, LabError> {
     let mesh = form.mesh(2)?;
-    let got = felt(form.place(), &made(&mesh, config)?, Elasticity::Linear, held)?;
+    let got = static_reaction(form.place(), &made(&mesh, config)?, Elasticity::Linear, held)?;
     Ok(off(got, full(form.place(), &mesh, config, None, held)?, 0.02))
 }
 
@@ -182,7 +182,7 @@ fn fine_mesh(element: Element, cells: [usize; 3]) -> Result<CaseOutcome, LabErro
     let held = HandPull { radius: 0.06, by: [0.0, 1e-6, 0.5e-6] };
     let at = [1.0, 0.05, 0.05];
     let body = made(&shapes::bar(cells, size)?, &Form::Bar.config(element))?;
-    let got = felt(at, &body, Elasticity::Linear, held)?;
+    let got = static_reaction(at, &body, Elasticity::Linear, held)?;
     let want = full(at, &shapes::bar([40, 4, 4], size)?, &Form::Bar.config(Element::Tet10), None, held)?;
     Ok(off(got, want, 0.05))
 }
@@ -195,6 +195,6 @@ fn reduced(material: Material, by: [f64; 3]) -> Result<CaseOutcome, LabError> {
         material: Some(material),
         ..form.config(Element::Tet10)
     };
-    let got = felt(form.place(), &made(&mesh, &config)?, Elasticity::Reduced, held)?;
+    let got = static_reaction(form.place(), &made(&mesh, &config)?, Elasticity::Reduced, held)?;
     Ok(off(got, full(form.place(), &mesh, &config, Some(material), held)?, 0.03))
 }

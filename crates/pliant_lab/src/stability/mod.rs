@@ -344,8 +344,8 @@ mod tests {
     #[test]
     fn a_case_that_breaks_its_bound_is_told_so() {
         let broken = Case::new("g", "n".into(), || Ok(CaseOutcome::of(vec![Bound::new("x", 3.0, 1.0)])));
-        let told = judge(&broken);
-        assert!(!told.passed && (told.margin - 1.0 / 3.0).abs() < 1e-12, "{told:?}");
+        let judged = judge(&broken);
+        assert!(!judged.passed && (judged.margin - 1.0 / 3.0).abs() < 1e-12, "{judged:?}");
         let failed = Case::new("g", "n".into(), || Err(LabError::Threads { got: 0, most: 1 }));
         assert!(!judge(&failed).passed);
     }
@@ -364,8 +364,8 @@ mod tests {
         // These are worse than known, better than known, another bound broken too, and not a
         // number.
         for (measured, other) in [(5.0, 0.5), (1.5, 0.5), (3.0, 2.0), (f64::NAN, 0.5), (0.5, 3.0)] {
-            let told = case(measured, other);
-            assert!(told.broken() && told.known_limit.is_none(), "{told:?}");
+            let judged = case(measured, other);
+            assert!(judged.broken() && judged.known_limit.is_none(), "{judged:?}");
         }
         let gone = case(0.5, 0.5);
         assert!(gone.passed && gone.limit_gone && gone.broken(), "{gone:?}");
@@ -383,7 +383,7 @@ mod tests {
     fn a_case_that_panics_is_told_and_is_the_only_one_lost() {
         let none: Vec<f64> = Vec::new();
         let run = move || Ok(CaseOutcome::of(vec![Bound::new("x", none[0], 1.0)]));
-        let told = judge(&Case::new("g", "n".into(), run));
-        assert!(told.broken() && told.bound.starts_with("panicked: index out of bounds"), "{told:?}");
+        let judged = judge(&Case::new("g", "n".into(), run));
+        assert!(judged.broken() && judged.bound.starts_with("panicked: index out of bounds"), "{judged:?}");
     }
 }

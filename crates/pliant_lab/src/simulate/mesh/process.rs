@@ -55,7 +55,7 @@ impl Mesh {
             none => none.insert(DeviceLoop::new(&self.model, process, self.now)?),
         };
         let state = self.processes.take_device(process, self.now);
-        self.felt.add(device.run(&self.model, self.now, state)?);
+        self.device_record.add(device.run(&self.model, self.now, state)?);
         Ok(())
     }
 
@@ -156,7 +156,7 @@ impl Mesh {
         }
         let most = 16 * self.nodes.len();
         self.ensure(finite, || format!("process {process} shows what is not finite"));
-        self.ensure(force <= MAX_FORCE, || format!("process {process} is told of {force} N"));
+        self.ensure(force <= MAX_FORCE, || format!("process {process} displays {force} N"));
         self.ensure(hands <= most, || format!("process {process} has {hands} hands"));
     }
 
@@ -196,8 +196,8 @@ impl Mesh {
                         .map(|other| (number(other), String::new()))
                         .collect();
                     let Some(session) = &mut self.nodes[process].session else { continue };
-                    let told = session.introduce(&others);
-                    self.ensure(told.is_ok(), || format!("process {process} tells nobody: {told:?}"));
+                    let sent = session.introduce(&others);
+                    self.ensure(sent.is_ok(), || format!("process {process} introduces nobody: {sent:?}"));
                 }
                 PeerEvent::Introduced { others, .. } => {
                     // A liar may tell of anybody.
