@@ -62,13 +62,14 @@ fn begin_at_obstacle<P: Member>(
     (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
     point.carried = carried(obstacle, &located.point, kernel.h)?;
     point.compliance = kernel.site_compliance(site, frame, q);
-    let gap = look(obstacle, &(located.point + point.carried))?.distance;
+    point.gap = look(obstacle, &(located.point + point.carried))?.distance;
     point.arm = located.point - Vector3::from(frame.center());
     // What sticks to a rigid body goes where that body goes.
     let stuck = obstacle.rigid().and_then(|key| rigid::find(group, key));
     let anchor = stuck.map_or(memory.anchor, |[at, _]| group.rigids[at].to_world(&memory.anchor));
-    let anchor = anchor + point.carried;
-    resume(&mut point, memory, &located.found.normal, gap, anchor, kernel.model.size());
+    let (carried, farthest) = (point.carried, SNAPPED * kernel.model.size());
+    let normal = &located.found.normal;
+    resume(&mut point, memory.force, normal, anchor + carried, carried, farthest);
     point.rigid = rigid::side(group, obstacle, &point, point.carried);
     Ok(point)
 }
@@ -98,32 +99,34 @@ fn begin_at_body(
     point.compliance = kernel.site_compliance(site, frame, q) + side.compliance;
     let anchor = side.anchor;
     point.far = Some(side);
-    resume(&mut point, memory, &near.normal, near.distance, anchor, size);
+    point.gap = near.distance;
+    let carried = point.carried;
+    resume(&mut point, memory.force, &near.normal, anchor, carried, SNAPPED * size);
     if let Some(far) = &mut point.far {
         far.anchor = point.anchor;
     }
     Some(point)
 }
 
-/// Gives a contact the force and the anchor of the step before.
-fn resume(
+/// Gives a contact the force and the anchor of the step before, and opens its gap by the dent of
+/// the force. `carried` leads from the contact's start to where the anchor counts. An anchor that
+/// is farther from there than `farthest` (m) is given up.
+pub(super) fn resume(
     point: &mut ContactPoint,
-    memory: &Memory,
+    force: Vector3<f64>,
     normal: &Vector3<f64>,
-    gap: f64,
     anchor: Vector3<f64>,
-    size: f64,
+    carried: Vector3<f64>,
+    farthest: f64,
 ) {
-    point.before = memory.force;
+    point.before = force;
     point.turn(normal);
-    point.pushed = point.axes * memory.force;
+    point.pushed = point.axes * force;
     point.force = point.pushed;
-    let dent = point.compliance * memory.force;
-    point.gap = gap + normal.dot(&dent);
-    point.anchor = anchor;
-    let way = point.anchor - (point.start + dent + point.carried);
-    let slipped = (way - normal * normal.dot(&way)).norm();
-    if slipped.is_nan() || slipped > SNAPPED * size {
-        point.anchor = point.start + dent + point.carried;
-    }
+    let dent = point.compliance * force;
+    point.gap += normal.dot(&dent);
+    let unslipped = point.start + dent + carried;
+    let slip = anchor - unslipped;
+    let slipped = (slip - normal * normal.dot(&slip)).norm();
+    point.anchor = if slipped.is_nan() || slipped > farthest { unslipped } else { anchor };
 }

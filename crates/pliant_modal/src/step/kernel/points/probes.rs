@@ -6,7 +6,13 @@ use super::super::{
     group::{Group, Member, View},
     touch::look,
 };
-use super::{RECOVERY_SPEED, begin::SNAPPED, carried, carrier_compliance, find, floor, pass::march, share};
+use super::{
+    RECOVERY_SPEED,
+    begin::{SNAPPED, resume},
+    carried, carrier_compliance, find, floor,
+    pass::march,
+    share,
+};
 use crate::{
     ProbeContact, StepError,
     contact::{AtProbe, Carriers, ContactPoint, Grown, Near, Place, ProbeMemory, Shape, Touched, Touching},
@@ -59,7 +65,8 @@ pub(in super::super) fn begin_probes<P: Member>(
                     point.gap = look(&**obstacle, &(probe.start + point.carried))?.distance;
                     point.gap -= probe.config().radius;
                     let carried = point.carried;
-                    resume(&mut point, memory, &found.normal, carried, f64::INFINITY);
+                    let anchor = memory.anchor + carried;
+                    resume(&mut point, memory.force, &found.normal, anchor, carried, f64::INFINITY);
                     point
                 }
                 Touched::Body(key) => {
@@ -73,7 +80,8 @@ pub(in super::super) fn begin_probes<P: Member>(
                     let near = near.unwrap_or_else(|| shape.at(&place, &probe.start));
                     let mut point = at_body(&view, &shape, (member, span, index), &place, probe, &near);
                     point.gap = near.distance - probe.config().radius;
-                    resume(&mut point, memory, &-near.normal, -probe.start, SNAPPED * shape.size);
+                    let (normal, farthest) = (-near.normal, SNAPPED * shape.size);
+                    resume(&mut point, memory.force, &normal, memory.anchor, -probe.start, farthest);
                     point
                 }
                 Touched::Probe(_) => continue,
@@ -82,30 +90,6 @@ pub(in super::super) fn begin_probes<P: Member>(
         }
     }
     Ok(())
-}
-
-/// Gives a contact the force and the anchor of the step before. `from` is what leads from its start
-/// to where the anchor counts.
-fn resume(
-    point: &mut ContactPoint,
-    memory: &ProbeMemory,
-    normal: &Vector3<f64>,
-    from: Vector3<f64>,
-    snaps: f64,
-) {
-    point.before = memory.force;
-    point.turn(normal);
-    point.pushed = point.axes * memory.force;
-    point.force = point.pushed;
-    let dent = point.compliance * memory.force;
-    point.gap += normal.dot(&dent);
-    let at_obstacle = point.probe.is_some_and(|probe| probe.first.is_none());
-    point.anchor = if at_obstacle { memory.anchor + from } else { memory.anchor };
-    let way = point.anchor - (point.start + dent + from);
-    let slipped = (way - normal * normal.dot(&way)).norm();
-    if slipped.is_nan() || slipped > snaps {
-        point.anchor = point.start + dent + from;
-    }
 }
 
 /// A contact of a probe with a body, before its first look at the end of the step.
