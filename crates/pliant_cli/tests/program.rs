@@ -32,27 +32,12 @@ fn a_bar_is_meshed_baked_and_inspected() {
     let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
     let told = succeeds(&["mesh", "bar", "--cells", "20,3,3", "--size", "1,0.15,0.15", "-o", &mesh]);
     assert!(told.contains("1080 tetrahedra"), "{told}");
-    let baked = json(&succeeds(&[
-        "bake",
-        &mesh,
-        "--element",
-        "tet4",
-        "--modes",
-        "12",
-        "--young",
-        "2e6",
-        "--poisson",
-        "0.3",
-        "--density",
-        "1100",
-        "--rayleigh",
-        "0.1,1e-4",
-        "--anchor",
-        "x<0.001",
-        "-o",
-        &model,
-        "--json",
-    ]));
+    let bake = |rest: &[&str]| {
+        let material = ["--young", "2e6", "--poisson", "0.3", "--density", "1100", "--rayleigh", "0.1,1e-4"];
+        let shape = ["--element", "tet4", "--modes", "12", "--anchor", "x<0.001"];
+        succeeds(&[&["bake", mesh.as_str()][..], &material, &shape, rest].concat())
+    };
+    let baked = json(&bake(&["-o", &model, "--json"]));
     let inspected = json(&succeeds(&["inspect", &model, "--json"]));
     for field in [
         "tets",
@@ -87,28 +72,7 @@ fn a_bar_is_meshed_baked_and_inspected() {
 
     // The same bake with another number of threads must give the same bits.
     let again = folder.file("again.modal");
-    succeeds(&[
-        "bake",
-        &mesh,
-        "--element",
-        "tet4",
-        "--modes",
-        "12",
-        "--young",
-        "2e6",
-        "--poisson",
-        "0.3",
-        "--density",
-        "1100",
-        "--rayleigh",
-        "0.1,1e-4",
-        "--anchor",
-        "x<0.001",
-        "--threads",
-        "1",
-        "-o",
-        &again,
-    ]);
+    bake(&["--threads", "1", "-o", &again]);
     assert_eq!(std::fs::read(&model).unwrap(), std::fs::read(&again).unwrap());
 }
 

@@ -279,14 +279,6 @@ impl VirtualDevice {
         self.velocity = velocity.into();
     }
 
-    /// Changes the grip. An invalid grip is refused.
-    pub fn set_hand(&mut self, hand: HandModel) {
-        if hand.is_valid() {
-            self.hand = hand;
-            self.coefficients = None;
-        }
-    }
-
     /// Returns the measured position, rounded to the encoder's step.
     fn measured(&self) -> Vector3<f64> {
         let step = self.config.resolution;

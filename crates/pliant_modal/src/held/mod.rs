@@ -294,11 +294,6 @@ impl HeldShapes {
         self.keys.iter().position(|own| *own == patch.key())
     }
 
-    /// Whether these are shapes of a patch.
-    pub fn are_of(&self, patch: &HeldPatch) -> bool {
-        self.find(patch).is_some()
-    }
-
     /// Mean displacement of a patch by the columns, `[axis][column]`, m.
     pub(crate) fn rows(&self, patch: &HeldPatch) -> Option<&cubature::Rows> {
         self.rows.get(self.find(patch)?)
