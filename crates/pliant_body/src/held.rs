@@ -51,7 +51,7 @@ impl HeldShapesCache {
     /// `Some(None)` where there are none: see [`HeldShapes::of_places`].
     pub fn get(&mut self, model: &Arc<ModalModel>, places: &[HeldPlace]) -> Option<Option<Arc<HeldShapes>>> {
         let is_finite =
-            |place: &HeldPlace| place.radius.is_finite() && place.way.iter().all(|x| x.is_finite());
+            |place: &HeldPlace| place.radius.is_finite() && place.displacement.iter().all(|x| x.is_finite());
         let has_mesh = model.parts().reduced.as_ref().is_some_and(|reduced| reduced.mesh.is_some());
         let is_few = !places.is_empty() && places.len() <= HeldShapes::MAX_PATCHES;
         if !is_few || !has_mesh || !places.iter().all(is_finite) {
@@ -94,7 +94,7 @@ impl HeldShapesCache {
         let away = |shapes: &HeldShapes| {
             places.iter().try_fold(0.0f64, |most, place| {
                 let made = shapes.places().find(|made| key(made) == key(place))?;
-                Some(most.max(DVec3::from(made.way).distance(place.way.into())))
+                Some(most.max(DVec3::from(made.displacement).distance(place.displacement.into())))
             })
         };
         let is_of = |entry: &&Entry| {

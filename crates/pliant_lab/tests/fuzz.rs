@@ -118,7 +118,7 @@ fn corpora_are_written() {
             write("datagrams", &format!("peer-{}", kind(bytes)), bytes);
         });
     }
-    let place = HeldPlace { vertex: 3, radius: 0.0625, way: [0.02, 0.0, -0.04] };
+    let place = HeldPlace { vertex: 3, radius: 0.0625, displacement: [0.02, 0.0, -0.04] };
     let state = PeerBodyState {
         body: 1,
         q: vec![0.5; 2],

@@ -364,7 +364,7 @@ fn a_peer_that_asks_for_shapes_all_day_harms_nobody() {
         let tick = mesh.peer(1).tick();
         let now = mesh.now;
         let way = f64::from(round) * 1e-5;
-        let sound = HeldPlace { vertex: corner, radius: RADIUS, way: [0.0, 0.01 + way, 0.0] };
+        let sound = HeldPlace { vertex: corner, radius: RADIUS, displacement: [0.0, 0.01 + way, 0.0] };
         let peer = mesh.peers[1].as_mut().unwrap();
         for (from, place) in [
             (0, sound),
@@ -373,7 +373,7 @@ fn a_peer_that_asks_for_shapes_all_day_harms_nobody() {
             (tick + 100_000, sound),
             (tick + 5, HeldPlace { vertex: 1 << 30, ..sound }),
             (tick + 5, HeldPlace { radius: 50.0, ..sound }),
-            (tick + 5, HeldPlace { way: [9.0, 0.0, 0.0], ..sound }),
+            (tick + 5, HeldPlace { displacement: [9.0, 0.0, 0.0], ..sound }),
         ] {
             let message = pliant_stream::wire::PeerMessage::Shapes { body: 1, from, places: vec![place] };
             peer.on_message(now, PeerId(0), &message.encode());

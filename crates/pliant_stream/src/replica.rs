@@ -334,7 +334,11 @@ impl Replica {
     pub(crate) fn held_place(&mut self, state: &State, vertex: u32, radius: f64) -> Option<HeldPlace> {
         let modal = self.patch(vertex, radius)?.displacement(&state.q, self.kernel.warps());
         let own = self.kernel.held_shapes().and_then(|shapes| shapes.mean(vertex, radius, &state.s));
-        Some(HeldPlace { vertex, radius, way: (modal + Vector3::from(own.unwrap_or_default())).into() })
+        Some(HeldPlace {
+            vertex,
+            radius,
+            displacement: (modal + Vector3::from(own.unwrap_or_default())).into(),
+        })
     }
 
     /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].

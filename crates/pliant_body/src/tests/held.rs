@@ -83,8 +83,8 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
     // They have followed the hand, to about where it is.
     let place = state(&app, body).body().held_places().next().unwrap();
     let made = state(&app, body).body().held_shapes().unwrap().places().next().unwrap();
-    let away = DVec3::from(place.way).distance(made.way.into());
-    assert!(away < 0.02 + 0.25 * DVec3::from(made.way).length(), "{made:?} for {place:?}");
+    let away = DVec3::from(place.displacement).distance(made.displacement.into());
+    assert!(away < 0.02 + 0.25 * DVec3::from(made.displacement).length(), "{made:?} for {place:?}");
     // The surface that is shown is the body's own.
     let visual = app.world().get::<VisualState>(body).unwrap();
     let (shapes, s) = visual.held().unwrap();
@@ -126,7 +126,8 @@ fn a_hand_that_does_not_stand_still_gets_new_shapes_on_its_way() {
         steps(&mut app, 1);
         std::thread::sleep(Duration::from_millis(2));
         let shapes = state(&app, body).body().held_shapes().unwrap();
-        farthest = shapes.places().map(|place| DVec3::from(place.way).length()).fold(farthest, f64::max);
+        farthest =
+            shapes.places().map(|place| DVec3::from(place.displacement).length()).fold(farthest, f64::max);
     }
 }
 

@@ -34,8 +34,8 @@ const FLOOD_GRABS: std::ops::Range<u16> = 100..104;
 const AHEAD: u64 = 4;
 /// Ticks of the host that are kept to compare with.
 const KEPT: usize = 400;
-/// Largest displayed reaction over the largest true one, also with a malicious guest: a fifth beyond it,
-/// and the rounding of the frames.
+/// Largest displayed reaction over the largest true one, also with a malicious guest: a fifth
+/// beyond it, and the rounding of the frames.
 const MAX_SHARE: f64 = 1.2 + 1e-3;
 
 struct Held {

@@ -24,7 +24,7 @@ impl Body {
         }
         config.check()?;
         let patch = HeldPatch::new(self.model(), patch, self.mode_count())?;
-        let local = patch.rest() + self.way(&patch);
+        let local = patch.rest() + self.patch_displacement(&patch);
         let target = self.state.frame.to_world(local);
         let id = GrabId(self.next_grab);
         self.next_grab += 1;
@@ -70,12 +70,12 @@ impl Body {
     pub fn held_places(&self) -> impl ExactSizeIterator<Item = HeldPlace> + Clone + '_ {
         self.hands.iter().map(|hand| {
             let (vertex, radius) = hand.patch.center_and_radius();
-            HeldPlace { vertex, radius, way: self.way(&hand.patch).into() }
+            HeldPlace { vertex, radius, displacement: self.patch_displacement(&hand.patch).into() }
         })
     }
 
     /// Mean displacement of a patch from rest, m, body axes.
-    pub(super) fn way(&self, patch: &HeldPatch) -> Vector3<f64> {
+    pub(super) fn patch_displacement(&self, patch: &HeldPatch) -> Vector3<f64> {
         let own = self.kernel.held_shapes().map(|shapes| shapes.displacement(patch, &self.state.s));
         patch.displacement(&self.state.q, self.kernel.warps()) + own.unwrap_or_default()
     }
@@ -145,7 +145,7 @@ impl Body {
     /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         let patch = &self.hands[self.find(id)?].patch;
-        let local = patch.rest() + self.way(patch);
+        let local = patch.rest() + self.patch_displacement(patch);
         Ok(self.state.frame.to_world(local).into())
     }
 

@@ -9,7 +9,7 @@ use super::{ObstacleShape, SurfacePoint};
 /// the contacts, and the step tells their sum.
 ///
 /// The other engine does the step of the rigid body. It must apply the force and the torque, and
-/// should let [`Rigid::weight`] of their way happen in the step, as of that of
+/// should let [`Rigid::weight`] of their displacement happen in the step, as of that of
 /// [`Rigid::acceleration`].
 #[derive(Debug, Clone, Default)]
 pub struct Rigid {
@@ -37,14 +37,15 @@ pub struct Rigid {
     pub force: [f64; 3],
     /// Set by a step: mean torque of the contacts about the center of mass, N m, world axes.
     pub torque: [f64; 3],
-    /// Set by a step: the way of the body by the force and the acceleration, as a share of `h^2`
-    /// times the acceleration that they give, 0.5 to 1.
+    /// Set by a step: the displacement of the body by the force and the acceleration, as a share of
+    /// `h^2` times the acceleration that they give, 0.5 to 1.
     pub weight: f64,
     /// Set by a step: whether a support holds the body against the contacts.
     pub is_held: bool,
-    /// Set by a step: way and turn by the force and the acceleration, m and rad, world axes.
-    pub way: Vector3<f64>,
-    /// As [`Rigid::way`].
+    /// Set by a step: displacement and turn by the force and the acceleration, m and rad, world
+    /// axes.
+    pub displacement: Vector3<f64>,
+    /// As [`Rigid::displacement`].
     pub turn: Vector3<f64>,
     /// Set by a step: the bodies that may touch it, by their indices.
     pub near: Vec<usize>,
@@ -104,12 +105,12 @@ impl Rigid {
         Vector3::from(self.center) + (1.0 - weight) * h * Vector3::from(self.velocity)
     }
 
-    /// Takes the way of the step under a force (N) and a torque (N m).
+    /// Takes the displacement of the step under a force (N) and a torque (N m).
     pub(crate) fn respond(&mut self, force: &Vector3<f64>, torque: &Vector3<f64>, weight: f64, h: f64) {
         let acceleration =
             Vector3::from(self.acceleration) + Vector3::from(self.inverse_mass).component_mul(force);
         self.weight = weight;
-        self.way = weight * h * h * acceleration;
+        self.displacement = weight * h * h * acceleration;
         self.turn = weight * h * h * (self.inertia() * torque);
     }
 
@@ -117,13 +118,13 @@ impl Rigid {
     pub(crate) fn displacement(&self, point: &Vector3<f64>, h: f64) -> Vector3<f64> {
         let arm = point - Vector3::from(self.center);
         let spin = h * Vector3::from(self.angular_velocity) + self.turn;
-        h * Vector3::from(self.velocity) + self.way + spin.cross(&arm)
+        h * Vector3::from(self.velocity) + self.displacement + spin.cross(&arm)
     }
 
     /// Where the material that is at `point` (m) at the end of the step would be without forces.
     pub(crate) fn pull_back(&self, point: &Vector3<f64>, h: f64) -> Vector3<f64> {
         let center = self.free_center(h);
-        center + UnitQuaternion::from_scaled_axis(-self.turn) * (point - center - self.way)
+        center + UnitQuaternion::from_scaled_axis(-self.turn) * (point - center - self.displacement)
     }
 
     fn turned(&self) -> UnitQuaternion<f64> {
@@ -180,7 +181,7 @@ impl Rigid {
     pub(crate) fn begin(&mut self) {
         (self.force, self.torque, self.weight) = ([0.0; 3], [0.0; 3], 1.0);
         self.is_held = false;
-        (self.way, self.turn) = (Vector3::zeros(), Vector3::zeros());
+        (self.displacement, self.turn) = (Vector3::zeros(), Vector3::zeros());
     }
 }
 
@@ -201,8 +202,8 @@ impl ObstacleShape for Pushed<'_> {
 }
 
 impl Pushed<'_> {
-    /// Way of the surface at a point by forces of the step, m.
-    pub(crate) fn way(&self, point: &Vector3<f64>) -> Vector3<f64> {
+    /// Displacement of the surface at a point by forces of the step, m.
+    pub(crate) fn displacement(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.by.map_or_else(Vector3::zeros, |rigid| point - rigid.pull_back(point, self.h))
     }
 }

@@ -212,8 +212,9 @@ impl ContactSites {
         self.bound_of(|k| q[k])
     }
 
-    /// Bound on the way of every site between two shapes, m. It holds up to the turn of the warp.
-    pub(crate) fn bound_of_way(&self, from: &[f64], to: &[f64]) -> f64 {
+    /// Bound on the travel of every site between two shapes, m. It holds up to the turn of the
+    /// warp.
+    pub(crate) fn travel_bound(&self, from: &[f64], to: &[f64]) -> f64 {
         self.bound_of(|k| to[k] - from[k])
     }
 

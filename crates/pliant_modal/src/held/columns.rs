@@ -23,22 +23,23 @@ const CORRECTION: f64 = 1e-8;
 /// Number of Newton rounds that find a shape anew with more columns.
 const AGAIN: usize = 2;
 
-/// Shares of the ways of hands at which shapes are found.
+/// Shares of the displacements of hands at which shapes are found.
 const SHARES: [f64; 4] = [0.35, 0.7, 1.0, 1.25];
 
-/// How far beside the end of its way a hand is in further shapes, as a share of the longest way and
-/// at least as a share of the body's size.
+/// How far beside the end of its path a hand is in further shapes, as a share of the longest path
+/// and at least as a share of the body's size.
 const BESIDE: [f64; 2] = [0.25, 0.04];
 
 /// Largest energy density of a shape beside, as a share of Young's modulus.
 const ENERGY: f64 = 0.02;
 
-/// Number of times that shapes on the ways of hands are corrected, and the number of columns that
+/// Number of times that shapes on the paths of hands are corrected, and the number of columns that
 /// each time adds.
 const CORRECTIONS: (usize, usize) = (3, 6);
 
-/// Number of points outside of the region that find shapes on the ways of hands. Inside, all points
-/// do: with half of them, the shapes bend where no point is, and pressing hands are off by 50 %.
+/// Number of points outside of the region that find shapes on the paths of hands. Inside, all
+/// points do: with half of them, the shapes bend where no point is, and pressing hands are off by
+/// 50 %.
 const OUTSIDE: usize = 400;
 
 /// Number of columns that are kept beside the static ones: of one patch, and of each further one.
@@ -47,7 +48,7 @@ const KEPT: [usize; 2] = [6, 2];
 /// Number of points from which those are taken.
 const OUTSIDE_ALL: usize = 2_000;
 
-/// The six directions in which hands are beside the ends of their ways.
+/// The six directions in which hands are beside the ends of their paths.
 const DIRECTIONS: [Vector3<f64>; 6] = [
     Vector3::new(1.0, 0.0, 0.0),
     Vector3::new(-1.0, 0.0, 0.0),
@@ -111,7 +112,7 @@ impl Columns {
         bare.beside(model, region, &energies, NEW, usize::MAX, None)
     }
 
-    /// Columns for hands that have led their patches by `ways` (m): shapes on the way there and
+    /// Columns for hands that have led their patches by `displacements` (m): shapes on the way and
     /// around its end are corrected again and again. Of all columns, those that these shapes use
     /// most are kept. Returns the columns and the shapes.
     pub(super) fn corrected(
@@ -120,11 +121,12 @@ impl Columns {
         region: &Region<'_>,
         loads: &[NodeLoad],
         law: Hyperelastic,
-        ways: &[Vector3<f64>],
+        displacements: &[Vector3<f64>],
     ) -> Option<(Self, Vec<GuidedShape>)> {
         let mut columns = self;
         let points = columns.some_points(model, region);
-        let mut shapes = led(model, law, &columns.omega(model), &points, &columns.rows(region, loads), ways)?;
+        let mut shapes =
+            led(model, law, &columns.omega(model), &points, &columns.rows(region, loads), displacements)?;
         let (times, more) = CORRECTIONS;
         for _ in 0..times {
             let Some(new) = columns.corrections(model, region, loads, law, &shapes, more) else { break };
@@ -346,23 +348,23 @@ fn coarse(model: &ModalModel, law: Hyperelastic, omega: &[f64], points: &[Point]
     ElasticEnergy::new(&few, law, omega).ok()
 }
 
-/// Finds the shapes in which all patches are led by shares of `ways` (m), and those in which one of
-/// them is a little beside the end of its way.
+/// Finds the shapes in which all patches are led by shares of `displacements` (m), and those in
+/// which one of them is a little beside the end of its path.
 fn led(
     model: &ModalModel,
     law: Hyperelastic,
     omega: &[f64],
     points: &[Point],
     patches: &[Rows],
-    ways: &[Vector3<f64>],
+    displacements: &[Vector3<f64>],
 ) -> Option<Vec<GuidedShape>> {
     let mut energy = coarse(model, law, omega, points)?;
     let mut out: Vec<GuidedShape> = Vec::new();
     let mut q = vec![0.0; omega.len()];
     let mut end = q.clone();
-    let far = ways.iter().map(|way| way.norm()).fold(0.0, f64::max);
+    let far = displacements.iter().map(|u| u.norm()).fold(0.0, f64::max);
     for share in SHARES.into_iter().filter(|_| far > 0.0) {
-        let there: Vec<Vector3<f64>> = ways.iter().map(|way| share * way).collect();
+        let there: Vec<Vector3<f64>> = displacements.iter().map(|u| share * u).collect();
         let Some(shape) = cubature::hold(&mut energy, omega, patches, &there, &q, cubature::ROUNDS) else {
             break;
         };
@@ -376,7 +378,7 @@ fn led(
     let beside = (BESIDE[0] * far).max(BESIDE[1] * model.size());
     for index in 0..patches.len() {
         for direction in &DIRECTIONS {
-            let mut there = ways.to_vec();
+            let mut there = displacements.to_vec();
             there[index] += beside * direction;
             if let Some(shape) = cubature::hold(&mut energy, omega, patches, &there, &end, cubature::ROUNDS) {
                 // Hands side by side would be torn apart.

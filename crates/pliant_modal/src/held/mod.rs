@@ -79,7 +79,7 @@ pub struct HeldPlace {
     /// Radius of the patch, m.
     pub radius: f64,
     /// Mean displacement of the patch from rest, m, body axes.
-    pub way: [f64; 3],
+    pub displacement: [f64; 3],
 }
 
 impl HeldPlace {
@@ -90,7 +90,7 @@ impl HeldPlace {
 }
 
 /// Hands that are farther from where shapes were made than this share of the body's size, and than
-/// this share of the longest way besides, need others.
+/// this share of the longest displacement besides, need others.
 const NEAR: f64 = 0.02;
 const NEAR_SHARE: f64 = 0.25;
 
@@ -103,7 +103,7 @@ pub struct HeldShapes {
     model: ModelHash,
     keys: Vec<PatchKey>,
     /// Where hands have led the patches, m, body axes.
-    ways: Vec<Vector3<f64>>,
+    patch_displacements: Vec<Vector3<f64>>,
     /// Mean displacement of each patch by the columns, `[axis][column]`, m.
     rows: Vec<cubature::Rows>,
     /// Least compliance of each patch at the baked stiffness, m/N.
@@ -148,16 +148,16 @@ impl HeldShapes {
                 .map_err(|_| StepError::Vertex { vertex, count })
         };
         let patches = places.iter().map(patch).collect::<Result<Vec<_>, _>>()?;
-        let ways: Vec<Vector3<f64>> = places.iter().map(|place| place.way.into()).collect();
-        Self::of_patches(model, &patches, &ways)
+        let displacements: Vec<Vector3<f64>> = places.iter().map(|place| place.displacement.into()).collect();
+        Self::of_patches(model, &patches, &displacements)
     }
 
     /// Returns the places that a body needs shapes for, where those that it has do not suffice:
     /// they are of other patches, or hands have gone farther than a fiftieth of the size and a
-    /// quarter of their way since. No places: the body needs no shapes any more.
+    /// quarter of their displacement since. No places: the body needs no shapes any more.
     ///
     /// At most [`HeldShapes::MAX_PATCHES`] of the places get shapes. They are in a fixed order, and
-    /// their ways are rounded, so that equal and nearby ones share their shapes.
+    /// their displacements are rounded, so that equal and nearby ones share their shapes.
     pub fn wanted(
         model: &ModalModel,
         held: impl IntoIterator<Item = HeldPlace>,
@@ -166,25 +166,27 @@ impl HeldShapes {
         let mut places: Vec<HeldPlace> = held.into_iter().take(Self::MAX_PATCHES).collect();
         places.sort_unstable_by_key(HeldPlace::key);
         places.dedup_by_key(|place| place.key());
-        for way in places.iter_mut().map(|place| &mut place.way) {
-            if !way.iter().all(|x| x.is_finite()) {
-                *way = [0.0; 3];
+        for displacement in places.iter_mut().map(|place| &mut place.displacement) {
+            if !displacement.iter().all(|x| x.is_finite()) {
+                *displacement = [0.0; 3];
             }
         }
         let size = model.size();
         let serves = |own: &Self| {
-            let farthest = own.ways.iter().map(|way| way.norm()).fold(0.0, f64::max);
-            let near = |(place, way): (&HeldPlace, &Vector3<f64>)| {
-                (Vector3::from(place.way) - way).norm() <= NEAR * size + NEAR_SHARE * farthest
+            let farthest =
+                own.patch_displacements.iter().map(|displacement| displacement.norm()).fold(0.0, f64::max);
+            let near = |(place, displacement): (&HeldPlace, &Vector3<f64>)| {
+                (Vector3::from(place.displacement) - displacement).norm()
+                    <= NEAR * size + NEAR_SHARE * farthest
             };
             places.iter().map(HeldPlace::key).eq(own.keys.iter().copied())
-                && places.iter().zip(&own.ways).all(near)
+                && places.iter().zip(&own.patch_displacements).all(near)
         };
         if own.map_or(places.is_empty(), serves) {
             return None;
         }
         for place in &mut places {
-            place.way = place.way.map(|x| (x / (NEAR * size)).round() * NEAR * size);
+            place.displacement = place.displacement.map(|x| (x / (NEAR * size)).round() * NEAR * size);
         }
         Some(places)
     }
@@ -192,7 +194,7 @@ impl HeldShapes {
     fn of_patches(
         model: &ModalModel,
         patches: &[Patch],
-        ways: &[Vector3<f64>],
+        patch_displacements: &[Vector3<f64>],
     ) -> Result<Option<Self>, StepError> {
         let count = model.surface().positions().len();
         for patch in patches {
@@ -218,7 +220,7 @@ impl HeldShapes {
         }
         let loads: Vec<NodeLoad> = patches.iter().map(|patch| region.load(patch)).collect();
         let columns = Columns::new(model, &region, &loads, law)
-            .and_then(|columns| columns.corrected(model, &region, &loads, law, ways));
+            .and_then(|columns| columns.corrected(model, &region, &loads, law, patch_displacements));
         let Some((columns, shapes)) = columns else { return Ok(None) };
         let width = columns.width;
         let whole = columns.rows(&region, &loads);
@@ -246,7 +248,7 @@ impl HeldShapes {
         Ok(Some(Self {
             model: model_hash,
             keys,
-            ways: ways.to_vec(),
+            patch_displacements: patch_displacements.to_vec(),
             rows,
             floors,
             columns: width,
@@ -275,10 +277,10 @@ impl HeldShapes {
 
     /// The patches, and where the hands had led them when the shapes were made.
     pub fn places(&self) -> impl ExactSizeIterator<Item = HeldPlace> + '_ {
-        self.keys.iter().zip(&self.ways).map(|(&(vertex, radius), &way)| HeldPlace {
+        self.keys.iter().zip(&self.patch_displacements).map(|(&(vertex, radius), &displacement)| HeldPlace {
             vertex,
             radius: f64::from_bits(radius),
-            way: way.into(),
+            displacement: displacement.into(),
         })
     }
 

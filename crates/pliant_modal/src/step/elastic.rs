@@ -66,11 +66,11 @@ pub(crate) struct ElasticStep {
     free: Vec<f64>,
     /// The three rows of each hand under the inverse of the factor.
     rows: Vec<f64>,
-    /// Scratch: the way of a round.
-    way: Vec<f64>,
-    /// Elastic energy of a way beyond which a round is far, J.
+    /// Scratch: the increment of a round.
+    increment: Vec<f64>,
+    /// Elastic energy of an increment beyond which a round is far, J.
     far: f64,
-    /// Elastic energy of the way of the round before, J.
+    /// Elastic energy of the increment of the round before, J.
     last: f64,
 }
 
@@ -85,17 +85,17 @@ struct Relaxing {
     begun: Vec<f64>,
 }
 
-/// Elastic energy of a way that counts as far, as a share of Young's modulus times the volume: a
-/// mean change of the strain by a twentieth. Tangents change little over nearer ways.
+/// Elastic energy of an increment that counts as far, as a share of Young's modulus times the
+/// volume: a mean change of the strain by a twentieth. Tangents change little over smaller ones.
 const FAR: f64 = 1.25e-3;
 
-/// Share of the energy of the way before above which rounds converge too slowly.
+/// Share of the energy of the increment before above which rounds converge too slowly.
 const SLOW: f64 = 0.1;
 
-/// Share of a far way's energy below which a way needs no further round.
+/// Share of a far increment's energy below which one needs no further round.
 const NOTHING: f64 = 1e-9;
 
-/// Number of halvings of a far way that does not lower the potential.
+/// Number of halvings of a far increment that does not lower the potential.
 const HALVINGS: usize = 8;
 
 impl ElasticStep {
@@ -121,17 +121,18 @@ impl ElasticStep {
         let omega2: Vec<f64> = std::iter::repeat_n(scale, columns).chain(omega2).collect();
         let zero = vec![0.0; count];
         let cholesky = Cholesky::new(count);
-        let (q, begun, unforced, free, way) = (zero.clone(), zero.clone(), zero.clone(), zero.clone(), zero);
+        let (q, begun, unforced, free, increment) =
+            (zero.clone(), zero.clone(), zero.clone(), zero.clone(), zero);
         let far = FAR * scale * model.info().young * energy.volume();
-        let (start, damping, rows) = (way.clone(), modes.damping.clone(), Vec::new());
+        let (start, damping, rows) = (increment.clone(), modes.damping.clone(), Vec::new());
         let mut response = vec![[0.0; 3]; count];
         response[..columns].fill([1.0 / scale, 0.0, 0.0]);
         let share = 0.5;
         let relaxing = relaxation.map(|relaxation| Relaxing {
             ratio: relaxation.ratio,
             weights: relaxation.linear_weights(h),
-            relaxed: way.clone(),
-            begun: way.clone(),
+            relaxed: increment.clone(),
+            begun: increment.clone(),
         });
         Some(Self {
             energy,
@@ -150,7 +151,7 @@ impl ElasticStep {
             unforced,
             free,
             rows,
-            way,
+            increment,
             far,
             last: 0.0,
         })
@@ -309,8 +310,8 @@ impl ElasticStep {
         self.reduce(patch, &self.begun)
     }
 
-    /// Way of a patch over the step so far, m, body axes.
-    pub(crate) fn way(&self, patch: &HeldPatch) -> Vector3<f64> {
+    /// Displacement of a patch over the step so far, m, body axes.
+    pub(crate) fn patch_displacement(&self, patch: &HeldPatch) -> Vector3<f64> {
         let six = self.reduce(patch, &self.q) - self.reduce(patch, &self.begun);
         Vector3::new(six[0], six[1], six[2])
     }
@@ -362,53 +363,58 @@ impl ElasticStep {
     /// step has to go on with a new tangent: the round went far, or hardly less far than the one
     /// before.
     ///
-    /// A far way is halved until it lowers the potential whose minimum the step seeks, with the
-    /// forces of this round.
+    /// A far increment is halved until it lowers the potential whose minimum the step seeks, with
+    /// the forces of this round.
     pub(crate) fn finish_round<'a>(
         &mut self,
         pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)> + Clone,
     ) -> bool {
         let n = self.q.len();
-        self.way.fill(0.0);
+        self.increment.fill(0.0);
         for ((_, pull), rows) in pulls.clone().zip(self.rows.chunks_exact(3 * n)) {
             for (force, row) in pull.iter().zip(rows.chunks_exact(n)) {
-                self.way.iter_mut().zip(row).for_each(|(out, row)| *out += force * row);
+                self.increment.iter_mut().zip(row).for_each(|(out, row)| *out += force * row);
             }
         }
-        self.cholesky.backward(&mut self.way);
-        for ((way, free), q) in self.way.iter_mut().zip(&self.free).zip(&self.q) {
-            *way += free - q;
+        self.cholesky.backward(&mut self.increment);
+        for ((increment, free), q) in self.increment.iter_mut().zip(&self.free).zip(&self.q) {
+            *increment += free - q;
         }
-        let size: f64 = self.way.iter().zip(&self.omega2).map(|(way, k)| 0.5 * k * way * way).sum();
+        let size: f64 = self
+            .increment
+            .iter()
+            .zip(&self.omega2)
+            .map(|(increment, k)| 0.5 * k * increment * increment)
+            .sum();
         let far = size.is_nan() || size > self.far;
         let share = if far { self.share(pulls) } else { 1.0 };
-        self.q.iter_mut().zip(&self.way).for_each(|(q, way)| *q += share * way);
+        self.q.iter_mut().zip(&self.increment).for_each(|(q, increment)| *q += share * increment);
         let slow = size > SLOW * self.last && size > NOTHING * self.far;
         self.last = size;
         far || slow
     }
 
-    /// The share of the way that lowers the potential.
+    /// The share of the increment that lowers the potential.
     fn share<'a>(&mut self, pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>) -> f64 {
         let work: f64 = pulls
             .map(|(patch, pull)| {
-                let moved = self.reduce(patch, &self.way);
+                let moved = self.reduce(patch, &self.increment);
                 pull.dot(&Vector3::new(moved[0], moved[1], moved[2]))
             })
             .sum();
         let t = self.share;
         let (mut slope, mut bend) = (-work, 0.0);
-        for (i, way) in self.way.iter().enumerate() {
+        for (i, increment) in self.increment.iter().enumerate() {
             let inverse = 1.0 / self.response[i][0];
             let straight = inverse * (self.q[i] - self.unforced[i]) - t * self.omega2[i] * self.q[i];
-            slope += (straight + self.start[i]) * way;
-            bend += 0.5 * (inverse - t * self.omega2[i]) * way * way;
+            slope += (straight + self.start[i]) * increment;
+            bend += 0.5 * (inverse - t * self.omega2[i]) * increment * increment;
         }
         let before = self.energy.energy(&self.q);
         let mut share = 1.0;
         for _ in 0..HALVINGS {
-            for ((out, q), way) in self.free.iter_mut().zip(&self.q).zip(&self.way) {
-                *out = q + share * way;
+            for ((out, q), increment) in self.free.iter_mut().zip(&self.q).zip(&self.increment) {
+                *out = q + share * increment;
             }
             let change = t * self.left() * (self.energy.energy(&self.free) - before);
             if change + share * (slope + share * bend) <= 0.0 {
@@ -419,12 +425,13 @@ impl ElasticStep {
         share
     }
 
-    /// Writes the force that would have moved the end of the last step by `way`, on its tangent.
-    pub(crate) fn force_of_way(&mut self, way: impl Fn(usize) -> f64, out: &mut [f64]) {
-        let (columns, modal) = self.way.split_at_mut(self.columns);
+    /// Writes the force that would have moved the end of the last step by `increment`, on its
+    /// tangent.
+    pub(crate) fn force_of_increment(&mut self, increment: impl Fn(usize) -> f64, out: &mut [f64]) {
+        let (columns, modal) = self.increment.split_at_mut(self.columns);
         columns.fill(0.0);
-        modal.iter_mut().enumerate().for_each(|(k, x)| *x = way(k));
-        self.cholesky.multiply(&self.way, &mut self.free);
+        modal.iter_mut().enumerate().for_each(|(k, x)| *x = increment(k));
+        self.cholesky.multiply(&self.increment, &mut self.free);
         out.iter_mut().zip(&self.free[self.columns..]).for_each(|(out, force)| *out = *force);
     }
 
@@ -432,8 +439,8 @@ impl ElasticStep {
     /// `force`, which holds the loads.
     ///
     /// The step may add no energy besides `supplied` (J), the work of the hands, and that of the
-    /// loads. Where the elasticity softens within a long way, it would: the velocities then give it
-    /// back.
+    /// loads. Where the elasticity softens within a long step, it would: the velocities then give
+    /// it back.
     pub(crate) fn finish(&mut self, before: &State, supplied: f64, force: &mut [f64], state: &mut State) {
         let mut released = 0.0;
         if let Some(relaxing) = &mut self.relaxing {
@@ -454,16 +461,16 @@ impl ElasticStep {
         let (columns, modal) = self.q.split_at(self.columns);
         state.s.resize(columns.len(), 0.0);
         state.s.copy_from_slice(columns);
-        let (mut way, mut work, mut kinetic) = (0.0, supplied + released, [0.0; 2]);
+        let (mut stiff, mut work, mut kinetic) = (0.0, supplied + released, [0.0; 2]);
         for ((now, begun), omega2) in columns.iter().zip(&self.begun).zip(&self.omega2) {
-            way += 0.5 * omega2 * (now - begun) * (now - begun);
+            stiff += 0.5 * omega2 * (now - begun) * (now - begun);
         }
         for (i, force) in force.iter_mut().enumerate() {
             let at = columns.len() + i;
             let own = (modal[i] - self.unforced[at]) / self.response[at][0];
             let moved = modal[i] - before.q[i];
             work += *force * moved;
-            way += 0.5 * self.omega2[at] * moved * moved;
+            stiff += 0.5 * self.omega2[at] * moved * moved;
             *force += own;
             state.q[i] = modal[i];
             state.v[i] += self.response[at][1] * own;
@@ -471,7 +478,7 @@ impl ElasticStep {
             kinetic[0] += 0.5 * before.v[i] * before.v[i];
             kinetic[1] += 0.5 * state.v[i] * state.v[i];
         }
-        if way <= GUARDED * self.far {
+        if stiff <= GUARDED * self.far {
             return;
         }
         let gained =
@@ -495,7 +502,7 @@ fn join(columns: usize, state: &State, out: &mut [f64]) {
     modal.copy_from_slice(&state.q);
 }
 
-/// Share of a far way's energy from which on a step's energy is checked: a mean change of the
+/// Share of a far increment's energy from which on a step's energy is checked: a mean change of the
 /// strain by two thousandths.
 const GUARDED: f64 = 1e-3;
 

@@ -310,7 +310,7 @@ impl Kernel {
     pub fn missing_force(&mut self, reached: &State, to: [&[f64]; 2], out: &mut [f64]) {
         let at = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
         if let Some(elastic) = &mut self.elastic {
-            elastic.force_of_way(|k| at(to[0], k) - reached.q[k], out);
+            elastic.force_of_increment(|k| at(to[0], k) - reached.q[k], out);
             // After a step that has failed, the tangent may have any value.
             if out.iter().any(|x| !x.is_finite()) {
                 out.fill(0.0);

@@ -489,7 +489,7 @@ impl PeerBody {
 /// A number from -1 to 1 that stands for the places that shapes were made of.
 fn name(shapes: &HeldShapes) -> f64 {
     let bits = |place: HeldPlace| {
-        let numbers = [place.radius, place.way[0], place.way[1], place.way[2]];
+        let numbers = [place.radius, place.displacement[0], place.displacement[1], place.displacement[2]];
         [u64::from(place.vertex)].into_iter().chain(numbers.map(f64::to_bits))
     };
     // FNV-1a over whole words. Its upper bits depend on all of them.

@@ -60,8 +60,8 @@ pub(crate) fn fit(model: &ModalModel, places: &[HeldPlace]) -> bool {
     let (size, count) = (model.size(), model.surface().positions().len());
     let key = |place: &HeldPlace| (place.vertex, place.radius.to_bits());
     let is_near = |place: &HeldPlace| {
-        let way = place.way.iter().map(|x| x * x).sum::<f64>().sqrt();
-        (place.vertex as usize) < count && (0.0..=size).contains(&place.radius) && way <= size
+        let length = place.displacement.iter().map(|x| x * x).sum::<f64>().sqrt();
+        (place.vertex as usize) < count && (0.0..=size).contains(&place.radius) && length <= size
     };
     (1..=HeldShapes::MAX_PATCHES).contains(&places.len())
         && places.iter().all(is_near)

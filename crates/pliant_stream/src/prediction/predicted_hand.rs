@@ -187,7 +187,7 @@ impl PredictedHand {
     /// Where a held patch is in the shown state. A hand that has just come is at rest.
     pub(crate) fn place(&self, vertex: u32, radius: f64) -> HeldPlace {
         let own = self.places.iter().find(|place| (place.vertex, place.radius) == (vertex, radius));
-        own.copied().unwrap_or(HeldPlace { vertex, radius, way: [0.0; 3] })
+        own.copied().unwrap_or(HeldPlace { vertex, radius, displacement: [0.0; 3] })
     }
 
     /// Finds the columns of held patches in the shown state. The last ones are the first guess.

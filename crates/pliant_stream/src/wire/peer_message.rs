@@ -79,7 +79,7 @@ impl PeerShapes {
 fn check_places(places: &[HeldPlace]) -> Result<(), StreamError> {
     let few = (1..=HeldShapes::MAX_PATCHES).contains(&places.len());
     check("held patches", few, places.len(), "1 to 4")?;
-    let sane = places.iter().all(|p| p.radius >= 0.0 && in_range(&[p.radius]) && in_range(&p.way));
+    let sane = places.iter().all(|p| p.radius >= 0.0 && in_range(&[p.radius]) && in_range(&p.displacement));
     check("held patches", sane, "a number out of range", "finite numbers")
 }
 

@@ -159,7 +159,8 @@ fn shapes_of_held_patches_that_are_none_are_refused() {
     shapes(0, places(1)).unwrap();
     shapes(1 << 40, places(4)).unwrap();
     let one = places(1)[0];
-    let [x, y, z] = [f64::NAN, f64::INFINITY, 1e300].map(|bad| HeldPlace { way: [0.0, bad, 0.0], ..one });
+    let [x, y, z] =
+        [f64::NAN, f64::INFINITY, 1e300].map(|bad| HeldPlace { displacement: [0.0, bad, 0.0], ..one });
     let [r, s] = [f64::NAN, -1.0].map(|radius| HeldPlace { radius, ..one });
     for bad in [x, y, z, r, s] {
         assert!(shapes(5, vec![bad]).is_err(), "{bad:?}");

@@ -89,7 +89,7 @@ pub(super) fn contacts() -> ContactState {
 
 /// Places of which shapes of held patches are made.
 pub(super) fn places(count: u32) -> Vec<HeldPlace> {
-    (0..count).map(|vertex| HeldPlace { vertex, radius: 0.25, way: [0.1, 0.0, -0.2] }).collect()
+    (0..count).map(|vertex| HeldPlace { vertex, radius: 0.25, displacement: [0.1, 0.0, -0.2] }).collect()
 }
 
 /// An obstacle of every shape.

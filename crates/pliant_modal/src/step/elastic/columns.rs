@@ -42,15 +42,16 @@ impl ElasticStep {
             }
             factor.factor();
             let missing = load.iter().zip(self.energy.force());
-            let mut way: Vec<f64> = missing.map(|(load, force)| load - force).collect();
-            factor.solve(&mut way);
+            let mut increment: Vec<f64> = missing.map(|(load, force)| load - force).collect();
+            factor.solve(&mut increment);
             // The columns have energy one half each at one.
-            let size: f64 = way.iter().map(|way| 0.5 * self.omega2[0] * way * way).sum();
+            let size: f64 =
+                increment.iter().map(|increment| 0.5 * self.omega2[0] * increment * increment).sum();
             let (before, old) = (potential(&self.energy, &self.q), self.q[..columns].to_vec());
             let mut share = 1.0;
             for _ in 0..HALVINGS {
-                for ((s, old), way) in self.q.iter_mut().zip(&old).zip(&way) {
-                    *s = old + share * way;
+                for ((s, old), increment) in self.q.iter_mut().zip(&old).zip(&increment) {
+                    *s = old + share * increment;
                 }
                 if potential(&self.energy, &self.q) <= before {
                     break;
@@ -87,7 +88,7 @@ impl ElasticStep {
     }
 
     fn lower_energy(&mut self, most: f64, state: &mut State) {
-        /// Largest number of rounds, and of halvings of a way that goes too far.
+        /// Largest number of rounds, and of halvings of an increment that goes too far.
         const ROUNDS: usize = 12;
         const BISECTIONS: usize = 24;
         let n = self.q.len();
@@ -115,15 +116,15 @@ impl ElasticStep {
                 row[i] += omega2;
             }
             factor.factor();
-            let mut way: Vec<f64> = self.energy.force().iter().map(|force| -force).collect();
-            factor.solve(&mut way);
+            let mut increment: Vec<f64> = self.energy.force().iter().map(|force| -force).collect();
+            factor.solve(&mut increment);
             begun.copy_from_slice(&all);
             let place = |all: &mut [f64], share: f64| {
-                for ((q, begun), way) in all.iter_mut().zip(&begun).zip(&way) {
-                    *q = begun + share * way;
+                for ((q, begun), increment) in all.iter_mut().zip(&begun).zip(&increment) {
+                    *q = begun + share * increment;
                 }
             };
-            // The shortest way that suffices, or else the best.
+            // The shortest increment that suffices, or else the best.
             let (mut best, mut low, mut high) = ((now, 0.0), 0.0, 1.0);
             for i in 0..BISECTIONS {
                 let share = if i == 0 { 1.0 } else { 0.5 * (low + high) };

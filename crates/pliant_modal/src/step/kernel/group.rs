@@ -203,7 +203,7 @@ impl<P: Member> Group<'_, P> {
         let Some(sites) = contacts.places.clone() else { return };
         let (bent, size) = (&mut contacts.bent, kernel.model.size());
         let known = bent.q.len() == state.q.len() && bent.cloud.sites.len() == sites.sites.len();
-        let way = if known { sites.bound_of_way(&bent.q, &state.q) } else { f64::INFINITY };
+        let way = if known { sites.travel_bound(&bent.q, &state.q) } else { f64::INFINITY };
         let near = bent.slack + way <= SLACK * size;
         if near {
             bent.slack += way;

@@ -115,7 +115,7 @@ impl Kernel {
                         0.5 * force.dot(&(turned(&self.creep, shapes, hand, q) * force))
                     };
                     let force = &solving.pull;
-                    let on_body = force.dot(&elastic.way(&hand.patch));
+                    let on_body = force.dot(&elastic.patch_displacement(&hand.patch));
                     match hand.hold {
                         // The hand supplies the residual flexibility of its patch first. That turns
                         // with the patch, and must not give back more than it got.

@@ -25,7 +25,7 @@ pub(super) use begin::begin;
 pub(super) use detect::detect;
 use pass::march;
 pub(super) use probes::{begin_probes, detect_probes, keep_at_probe};
-pub(super) use rigid::{begin_supports, fill_rows, respond, set_arms, support, take_supports, tell};
+pub(super) use rigid::{begin_supports, fill_rows, respond, set_arms, support, take_supports, write_forces};
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
 const RECOVERED: f64 = 0.2;
@@ -174,7 +174,7 @@ pub(super) fn linearize<P: Member>(
                 point.compliance = own;
                 point.turn(&normal);
                 if let Some(far) = &mut point.rigid {
-                    point.carried = far.carried + obstacle.way(&located.point);
+                    point.carried = far.carried + obstacle.displacement(&located.point);
                     point.anchor = far.anchor + point.carried;
                     if point.mean.is_none() {
                         let end = if settles { located.point } else { point.start };

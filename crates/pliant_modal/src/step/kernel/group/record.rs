@@ -27,7 +27,7 @@ impl<P: Member> Group<'_, P> {
         for &probe in self.held {
             self.probes[probe].memory.clear();
         }
-        points::tell(self, work);
+        points::write_forces(self, work);
         for point in &work.points {
             if let Some((probe, contact, memory)) = points::keep_at_probe(self, point) {
                 let probe = &mut self.probes[probe];

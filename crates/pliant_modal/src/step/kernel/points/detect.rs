@@ -103,14 +103,14 @@ fn list_looks<P: Member>(group: &mut Group<'_, P>, work: &mut Touching, band: f6
                 continue;
             }
             let clear = work.clearance([view.contacts.key, far.contacts.key]);
-            if !take_way(&mut work.clear[clear], [&view, &far], sites, bound, band) {
+            if !spend_clearance(&mut work.clear[clear], [&view, &far], sites, bound, band) {
                 continue;
             }
             work.looks.push(Look { members });
             let frames = [&view, &far].map(|view| [&view.kernel.before.frame, &view.state.frame]);
-            let way = relative_way(frames[0], frames[1], sites.radius + bound)
-                + sites.bound_of_way(&view.kernel.before.q, &view.state.q)
-                + far_sites.bound_of_way(&far.kernel.before.q, &far.state.q);
+            let way = relative_travel(frames[0], frames[1], sites.radius + bound)
+                + sites.travel_bound(&view.kernel.before.q, &view.state.q)
+                + far_sites.travel_bound(&far.kernel.before.q, &far.state.q);
             let size = view.kernel.model.size().min(far.kernel.model.size());
             if band > 0.0 && way > DEEP * size {
                 members.into_iter().for_each(|member| group.place_start(member));
@@ -126,7 +126,7 @@ fn travel(view: &View<'_>, sites: &ContactSites) -> [f64; 2] {
     let turned = (from.rotation().inverse() * to.rotation()).angle();
     let (bound, start) = (sites.bound(&now.q), sites.bound(&before.q));
     let swing = 2.0 * (0.5 * turned.min(std::f64::consts::PI)).sin() * (sites.radius + bound.max(start));
-    let bent = sites.bound_of_way(&before.q, &now.q);
+    let bent = sites.travel_bound(&before.q, &now.q);
     let way = (Vector3::from(to.center()) - Vector3::from(from.center())).norm();
     [way + swing + bent, bound]
 }
@@ -214,7 +214,7 @@ fn detect_at_obstacle<P: Member>(
         point.tangent = tangent;
         let by_itself = carried(free, &located.point, kernel.h)?;
         point.gap = look(free, &(start + by_itself))?.distance;
-        point.carried = by_itself + pushed.way(&located.point);
+        point.carried = by_itself + pushed.displacement(&located.point);
         let way = located.point - start - point.carried;
         point.anchor = start + point.carried + share(point.gap, found.distance) * way;
         point.rigid = rigid::side(group, free, &point, by_itself);
@@ -400,9 +400,9 @@ fn detect_at_body<P: Member>(
     penetrates
 }
 
-/// Bound on the way of the points within a radius of the center of one frame relative to another
+/// Bound on the travel of the points within a radius of the center of one frame relative to another
 /// frame, m.
-fn relative_way(own: [&Frame; 2], other: [&Frame; 2], radius: f64) -> f64 {
+fn relative_travel(own: [&Frame; 2], other: [&Frame; 2], radius: f64) -> f64 {
     let [from, to] = [0, 1].map(|k| {
         let turn = other[k].rotation().inverse();
         (other[k].to_local(&Vector3::from(own[k].center())), turn * own[k].rotation())
@@ -411,9 +411,9 @@ fn relative_way(own: [&Frame; 2], other: [&Frame; 2], radius: f64) -> f64 {
     (to.0 - from.0).norm() + 2.0 * (0.5 * turned).sin() * radius
 }
 
-/// Takes the relative way of two bodies since the last look from their clearances. Returns whether
-/// any site may be nearer than `band`.
-fn take_way(
+/// Takes the relative travel of two bodies since the last search from their clearances. Returns
+/// whether any site may be nearer than `band`.
+fn spend_clearance(
     clear: &mut Clearance,
     views: [&View<'_>; 2],
     sites: &ContactSites,
@@ -426,7 +426,7 @@ fn take_way(
     if clear.sites.len() == count {
         let [own, far] = &clear.frames;
         // The bound covers the shape before too, as the way of bending is counted apart.
-        let turning = relative_way([own, &frames[0]], [far, &frames[1]], sites.radius + bound);
+        let turning = relative_travel([own, &frames[0]], [far, &frames[1]], sites.radius + bound);
         let way = turning + (ways[0] - clear.ways[0]) + (ways[1] - clear.ways[1]);
         // A way that is no number leaves no clearance.
         let way = if way.is_nan() { f64::INFINITY } else { way };

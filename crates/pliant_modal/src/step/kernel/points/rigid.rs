@@ -176,7 +176,7 @@ pub(in super::super) fn take_supports<P>(group: &mut Group<'_, P>, work: &mut To
 
 /// Writes what the contacts have done to the rigid bodies. Without a force the weight is that of
 /// no contact.
-pub(in super::super) fn tell<P>(group: &mut Group<'_, P>, work: &Touching) {
+pub(in super::super) fn write_forces<P>(group: &mut Group<'_, P>, work: &Touching) {
     for &index in group.pushed {
         let [force, torque] = sum(&work.points, index);
         let rigid = &mut group.rigids[index];
