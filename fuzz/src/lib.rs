@@ -14,7 +14,7 @@ use pliant_modal::{
 };
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
-use pliant_stream::watch::{BodyDecoder, Catalog, Hands, WatchSurface};
+use pliant_stream::watch::{BodyDecoder, Catalog, WatchHands, WatchSurface};
 use pliant_stream::wire::{Datagram, GuestMessage, HostMessage, PeerMessage};
 use pliant_stream::{
     BodyId, Channel, GrabState, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
@@ -78,8 +78,8 @@ pub fn watch(bytes: &[u8]) {
     if let Ok(catalog) = Catalog::decode(bytes) {
         assert_eq!(Catalog::decode(&catalog.encode()), Ok(catalog));
     }
-    if let Ok(hands) = Hands::decode(bytes) {
-        assert!(Hands::decode(&hands.encode()).is_ok());
+    if let Ok(hands) = WatchHands::decode(bytes) {
+        assert!(WatchHands::decode(&hands.encode()).is_ok());
     }
     if let Ok(surface) = WatchSurface::decode(bytes) {
         assert_eq!(WatchSurface::decode(&surface.encode()), Ok(surface));

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use pliant_modal::{ModalModel, ModelHash};
 use pliant_stream::watch::{
-    BodyDecoder, BodyEncoder, Catalog, CatalogBody, CatalogCamera, Hands, WatchConfig, WatchHand,
+    BodyDecoder, BodyEncoder, Catalog, CatalogBody, CatalogCamera, WatchConfig, WatchHand, WatchHands,
     WatchNumbers, WatchSurface, coordinate_steps,
 };
 use pliant_stream::{BodyId, GrabKey, Placement, RigidState, TickState, UserId};
@@ -172,9 +172,9 @@ fn hands() -> Value {
         reaction: [1.0 / 7.0, -12.5, 0.001 * f64::from(number)],
     };
     let numbers = WatchNumbers { people: 12, loss: Some(0.25), round_trip: 0.123_456, dropped: 70_000 };
-    let sent = Hands { tick: (1 << 33) + 5, numbers, hands: vec![hand(0), hand(400)] };
+    let sent = WatchHands { tick: (1 << 33) + 5, numbers, hands: vec![hand(0), hand(400)] };
     let bytes = sent.encode();
-    let got = Hands::decode(&bytes).unwrap();
+    let got = WatchHands::decode(&bytes).unwrap();
     let hands: Vec<Value> = got
         .hands
         .iter()

@@ -163,7 +163,7 @@ fn corpora_are_written() {
     }
     // What watchers get.
     use pliant_stream::watch::{
-        BodyEncoder, Catalog, CatalogBody, Hands, WatchConfig, WatchHand, WatchSurface,
+        BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchHand, WatchHands, WatchSurface,
     };
     let model = support::loose_bar(4, 0.05);
     let body = CatalogBody {
@@ -182,7 +182,11 @@ fn corpora_are_written() {
     let name = "a session".to_owned();
     let catalog = Catalog { session: 1, step: 0.025, name, bodies: vec![body], cameras: Vec::new() };
     write("watch", "catalog", &catalog.encode());
-    write("watch", "hands", &Hands { hands: vec![WatchHand::default(); 2], ..Hands::default() }.encode());
+    write(
+        "watch",
+        "hands",
+        &WatchHands { hands: vec![WatchHand::default(); 2], ..WatchHands::default() }.encode(),
+    );
     write("watch", "surface", &WatchSurface::new(&support::bar(2, 0.05), 2).encode());
     let config = WatchConfig { rate: 40.0, ..WatchConfig::default() };
     let mut encoder = BodyEncoder::new(&model, config, 0.025).unwrap();

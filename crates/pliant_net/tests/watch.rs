@@ -21,7 +21,7 @@ use pliant_net::watch::{
     PublishOptions, RelayOptions, WatchCommands, WatchEvent, WatchPlugin, WatchState, WatchView, Watcher,
 };
 use pliant_net::{HostConfig, NetHost, NetPlugin, RemoteHands};
-use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, Hands, WatchConfig, WatchSurface};
+use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchHands, WatchSurface};
 use pliant_stream::{BodyId, Placement, TickState};
 use relay::{Certificate, TestRelay};
 use support::{TIP, alone, app, bar, body_of, host, must, run_until, tick, wait_for};
@@ -73,7 +73,7 @@ struct Seen {
     catalogs: Vec<Catalog>,
     models: BTreeMap<BodyId, Arc<ModalModel>>,
     states: Vec<(u64, Vec<f64>)>,
-    hands: Vec<Hands>,
+    hands: Vec<WatchHands>,
     over: u32,
     wrong: Vec<String>,
     connected: u32,

@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch};
 use pliant_stream::watch::{
-    Assembler, BodyDecoder, BodyEncoder, Catalog, CatalogBody, CatalogCamera, Hands, MAX_GROUP_FRAMES,
-    MAX_MODEL, MAX_PIECE, WatchConfig, WatchFrame, WatchHand, WatchNumbers, WatchState, WatchSurface,
+    Assembler, BodyDecoder, BodyEncoder, Catalog, CatalogBody, CatalogCamera, MAX_GROUP_FRAMES, MAX_MODEL,
+    MAX_PIECE, WatchConfig, WatchFrame, WatchHand, WatchHands, WatchNumbers, WatchSurface, WatchedState,
     coordinate_steps, pieces,
 };
 use pliant_stream::{BodyId, GrabKey, Placement, RigidState, StreamError, TickState, UserId};
@@ -80,7 +80,7 @@ fn watch(model: &Arc<ModalModel>, course: &[Vec<f64>], config: WatchConfig) -> M
     let warps = model.parts().reduced.is_none();
     let mut encoder = BodyEncoder::new(model, config, STEP).unwrap();
     let mut decoder = BodyDecoder::new(coordinate_steps(model, config.modes));
-    let (mut bytes, mut frames, mut rounding) = (0, Vec::<WatchState>::new(), 0.0_f64);
+    let (mut bytes, mut frames, mut rounding) = (0, Vec::<WatchedState>::new(), 0.0_f64);
     for (k, q) in course.iter().enumerate() {
         let tick = 1000 + k as u64;
         let Some(frame) = encoder.encode(&tick_state(tick, q, None)).unwrap() else { continue };
@@ -303,7 +303,7 @@ fn catalog() -> Catalog {
     Catalog { session, step, name, bodies: vec![body(3), body(9)], cameras: vec![camera] }
 }
 
-fn hands() -> Hands {
+fn hands() -> WatchHands {
     let hand = WatchHand {
         body: BodyId(3),
         key: GrabKey { user: UserId(2), grab: 7 },
@@ -311,15 +311,15 @@ fn hands() -> Hands {
         reaction: [0.0, 2.0, -1.0],
     };
     let numbers = WatchNumbers { people: 3, loss: Some(0.5), round_trip: 0.125, dropped: 4 };
-    Hands { tick: 1 << 40, numbers, hands: vec![hand; 5] }
+    WatchHands { tick: 1 << 40, numbers, hands: vec![hand; 5] }
 }
 
 #[test]
 fn catalogs_and_hands_come_back() {
     assert_eq!(Catalog::decode(&catalog().encode()).unwrap(), catalog());
-    assert_eq!(Hands::decode(&hands().encode()).unwrap(), hands());
-    let unknown = Hands { numbers: WatchNumbers { loss: None, ..hands().numbers }, ..hands() };
-    assert_eq!(Hands::decode(&unknown.encode()).unwrap(), unknown);
+    assert_eq!(WatchHands::decode(&hands().encode()).unwrap(), hands());
+    let unknown = WatchHands { numbers: WatchNumbers { loss: None, ..hands().numbers }, ..hands() };
+    assert_eq!(WatchHands::decode(&unknown.encode()).unwrap(), unknown);
     let long = Catalog { name: "ä".repeat(64), ..catalog() };
     assert_eq!(Catalog::decode(&long.encode()).unwrap().name, "ä".repeat(32));
     let mut twice = catalog();
@@ -339,7 +339,7 @@ fn hostile_bytes_are_refused() {
     for whole in [catalog().encode(), hands().encode(), surface.clone()] {
         for length in 0..whole.len().min(2000) {
             let cut = &whole[..length];
-            assert!(Catalog::decode(cut).is_err() && Hands::decode(cut).is_err());
+            assert!(Catalog::decode(cut).is_err() && WatchHands::decode(cut).is_err());
             assert!(WatchSurface::decode(cut).is_err());
         }
         let mut seed = 7;
@@ -349,7 +349,7 @@ fn hostile_bytes_are_refused() {
                 let at = random(&mut seed) as usize % damaged.len().min(300);
                 damaged[at] = random(&mut seed) as u8;
             }
-            let _ = (Catalog::decode(&damaged), Hands::decode(&damaged), WatchSurface::decode(&damaged));
+            let _ = (Catalog::decode(&damaged), WatchHands::decode(&damaged), WatchSurface::decode(&damaged));
         }
     }
     // Counts that promise more than there is.

@@ -11,8 +11,8 @@ use moq_net::{broadcast, origin, track};
 use pliant_modal::{ModalModel, ModelHash};
 use pliant_stream::BodyId;
 use pliant_stream::watch::{
-    Assembler, BodyDecoder, CATALOG_TRACK, Catalog, CatalogBody, HANDS_TRACK, Hands, MAX_FRAME, MAX_MODEL,
-    WatchState, body_track, coordinate_steps, model_track,
+    Assembler, BodyDecoder, CATALOG_TRACK, Catalog, CatalogBody, HANDS_TRACK, MAX_FRAME, MAX_MODEL,
+    WatchHands, WatchedState, body_track, coordinate_steps, model_track,
 };
 use tokio::sync::OnceCell;
 use tokio::sync::mpsc::{Receiver, Sender, channel};
@@ -41,11 +41,11 @@ pub enum WatchEvent {
     /// A body has its model.
     Body(CatalogBody, Arc<ModalModel>),
     /// A frame of a body that has its model.
-    State(BodyId, WatchState),
+    State(BodyId, WatchedState),
     /// The catalog has a body no longer.
     Gone(BodyId),
     /// Hands and numbers.
-    Hands(Hands),
+    Hands(WatchHands),
     /// The host's session is over, or its relay has lost it. It is waited for.
     Over,
     /// The relay or the host has sent what is none. It was left out.
@@ -190,7 +190,7 @@ impl Scene {
             if let Ok(mut track) = self.subscribe(HANDS_TRACK, 1).await {
                 while let Ok(Some(mut group)) = track.next_group().await {
                     while let Ok(Some(frame)) = group.read_frame().await {
-                        match checked(&frame.payload).and_then(|bytes| decoded(Hands::decode(bytes))) {
+                        match checked(&frame.payload).and_then(|bytes| decoded(WatchHands::decode(bytes))) {
                             Ok(hands) => self.tell(WatchEvent::Hands(hands)).await,
                             Err(wrong) => {
                                 self.tell(WatchEvent::Wrong(wrong)).await;

@@ -10,8 +10,8 @@ use bevy::prelude::*;
 use moq_net::{Timestamp, broadcast, group, origin, track};
 use pliant_modal::{ModalModel, ModelHash};
 use pliant_stream::watch::{
-    BodyEncoder, CATALOG_TRACK, Catalog, CatalogBody, CatalogCamera, HANDS_TRACK, Hands, MAX_MODEL,
-    WatchConfig, WatchHand, WatchNumbers, WatchSurface, body_track, model_track, pieces, surface_track,
+    BodyEncoder, CATALOG_TRACK, Catalog, CatalogBody, CatalogCamera, HANDS_TRACK, MAX_MODEL, WatchConfig,
+    WatchHand, WatchHands, WatchNumbers, WatchSurface, body_track, model_track, pieces, surface_track,
 };
 use pliant_stream::{BodyId, Placement, Tick, TickState};
 use tokio::sync::mpsc::{Receiver, Sender, channel};
@@ -334,7 +334,7 @@ impl HostWatch {
                 true => WatchNumbers { dropped: self.stats.dropped.min(u32::MAX.into()) as u32, ..numbers },
                 false => WatchNumbers::default(),
             };
-            let bytes = Hands { tick, numbers, hands }.encode();
+            let bytes = WatchHands { tick, numbers, hands }.encode();
             let length = bytes.len();
             self.send(Item::Hands(tick, bytes), length);
         }

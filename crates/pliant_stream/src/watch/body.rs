@@ -288,7 +288,7 @@ fn started(value: i32, step: i32, level: u32) -> Past {
 
 /// What a watcher sees of a body at a tick.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct WatchState {
+pub struct WatchedState {
     /// The host's tick.
     pub tick: Tick,
     /// Modal coordinates, kg^1/2 m. Those of the model's further modes are 0.
@@ -317,7 +317,7 @@ pub struct BodyDecoder {
     modes: usize,
     past: Vec<Past>,
     frames: usize,
-    state: WatchState,
+    state: WatchedState,
 }
 
 impl BodyDecoder {
@@ -330,12 +330,12 @@ impl BodyDecoder {
             modes: 0,
             past: Vec::new(),
             frames: 0,
-            state: WatchState::default(),
+            state: WatchedState::default(),
         }
     }
 
     /// The state of the last frame. `None` before the first snapshot and after a wrong frame.
-    pub fn state(&self) -> Option<&WatchState> {
+    pub fn state(&self) -> Option<&WatchedState> {
         (self.frames > 0).then_some(&self.state)
     }
 
@@ -345,7 +345,7 @@ impl BodyDecoder {
     /// [`StreamError::Truncated`], [`StreamError::Invalid`] or [`StreamError::NotFinite`] for wrong
     /// bytes. [`StreamError::State`] for a frame without its snapshot. [`StreamError::Full`] for a
     /// group that does not end.
-    pub fn decode(&mut self, frame: &[u8]) -> Result<(WatchFrame, &WatchState), StreamError> {
+    pub fn decode(&mut self, frame: &[u8]) -> Result<(WatchFrame, &WatchedState), StreamError> {
         match self.read(frame) {
             Ok(kind) => Ok((kind, &self.state)),
             Err(error) => {

@@ -37,7 +37,7 @@ pub struct WatchNumbers {
 
 /// A frame of the track of hands.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Hands {
+pub struct WatchHands {
     /// The host's tick.
     pub tick: Tick,
     /// Numbers of the session.
@@ -46,7 +46,7 @@ pub struct Hands {
     pub hands: Vec<WatchHand>,
 }
 
-impl Hands {
+impl WatchHands {
     /// The frame in bytes. Positions are rounded to single precision, forces to 2^-16, losses to
     /// 1/254 and round trips to microseconds.
     pub fn encode(&self) -> Vec<u8> {

@@ -11,7 +11,7 @@
 //! | [`model_track`] | the pieces of a `.modal` file | [`pieces`], [`Assembler`] |
 //! | [`surface_track`] | the pieces of the surface and the modes, for shaders | [`WatchSurface`] |
 //! | [`body_track`] | a snapshot, then frames that lean on it | [`BodyEncoder`], [`BodyDecoder`] |
-//! | [`HANDS_TRACK`] | frames that stand alone: hands and numbers of the session | [`Hands`] |
+//! | [`HANDS_TRACK`] | frames that stand alone: hands and numbers of the session | [`WatchHands`] |
 //!
 //! Guests get another stream ([`codec`](crate::codec)), which predicts with the kernel that steps
 //! the body. Watchers have no kernel: a page in a browser draws, and nothing else. So the frames
@@ -31,9 +31,9 @@ mod playout;
 mod residual;
 mod surface;
 
-pub use body::{BodyDecoder, BodyEncoder, EncodedFrame, WatchConfig, WatchFrame, WatchState};
+pub use body::{BodyDecoder, BodyEncoder, EncodedFrame, WatchConfig, WatchFrame, WatchedState};
 pub use catalog::{Catalog, CatalogBody, CatalogCamera};
-pub use hands::{Hands, WatchHand, WatchNumbers};
+pub use hands::{WatchHand, WatchHands, WatchNumbers};
 pub use pieces::{Assembler, MAX_PIECE, pieces};
 pub use playout::{Playout, TickClock};
 pub use surface::{WatchSurface, coordinate_steps};

@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::WatchState;
+use super::WatchedState;
 use crate::state::{RigidState, Tick};
 
 /// Most states of a body that wait to be drawn.
@@ -60,7 +60,7 @@ impl TickClock {
 #[derive(Debug, Clone)]
 pub struct Playout {
     every: u64,
-    states: VecDeque<WatchState>,
+    states: VecDeque<WatchedState>,
 }
 
 impl Playout {
@@ -70,12 +70,12 @@ impl Playout {
     }
 
     /// The newest state.
-    pub fn newest(&self) -> Option<&WatchState> {
+    pub fn newest(&self) -> Option<&WatchedState> {
         self.states.back()
     }
 
     /// Takes a state. One that is older than the newest is left out, unless ticks are counted anew.
-    pub fn push(&mut self, state: WatchState) {
+    pub fn push(&mut self, state: WatchedState) {
         if let Some(last) = self.states.back() {
             if state.tick <= last.tick {
                 if last.tick - state.tick < OVERLAP * self.every {
@@ -84,7 +84,7 @@ impl Playout {
                 self.states.clear();
             } else if last.resting && state.tick > last.tick + self.every {
                 // It slept until a moment ago, and did not glide all that time.
-                let until = WatchState { tick: state.tick - self.every, ..last.clone() };
+                let until = WatchedState { tick: state.tick - self.every, ..last.clone() };
                 self.states.push_back(until);
             }
         }
@@ -131,8 +131,8 @@ fn between(from: &RigidState, to: &RigidState, part: f64) -> RigidState {
 mod tests {
     use super::*;
 
-    fn state(tick: Tick, x: f64, resting: bool) -> WatchState {
-        WatchState { tick, q: vec![x], pose: None, resting }
+    fn state(tick: Tick, x: f64, resting: bool) -> WatchedState {
+        WatchedState { tick, q: vec![x], pose: None, resting }
     }
 
     #[test]
