@@ -134,18 +134,18 @@ pub(crate) fn forget_body(
     }
 }
 
-/// Fills in the obstacles that stand still, for who steps a body elsewhere.
-pub(crate) fn tell_fixed(
+/// Fills in the obstacles that stand still, for a copy of the body that is stepped elsewhere.
+pub(crate) fn fill_fixed(
     added: On<Insert, FixedObstacles>,
     obstacles: Query<(&Motion, Option<&ContactLayers>)>,
     mut bodies: Query<(&mut FixedObstacles, &BodyState, Option<&ContactLayers>, Option<&BodyFriction>)>,
 ) {
-    let Ok((mut told, state, layers, friction)) = bodies.get_mut(added.entity) else { return };
+    let Ok((mut fixed, state, layers, friction)) = bodies.get_mut(added.entity) else { return };
     let layers = layers.copied().unwrap_or_default();
     let touches = |other: Option<&ContactLayers>| layers.touch(other.copied().unwrap_or_default());
     let near = obstacles.iter().filter(|(motion, other)| motion.sound && touches(*other));
-    told.obstacles = near.filter_map(|(motion, _)| motion.obstacle(state.scale()).fixed()).collect();
-    told.friction = friction.copied().unwrap_or_default().0;
+    fixed.obstacles = near.filter_map(|(motion, _)| motion.obstacle(state.scale()).fixed()).collect();
+    fixed.friction = friction.copied().unwrap_or_default().0;
 }
 
 type Bodies<'w, 's> = Query<

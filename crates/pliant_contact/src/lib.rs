@@ -97,7 +97,7 @@ impl Plugin for ContactPlugin {
             .register_type::<contacts::Nearby>()
             .add_observer(contacts::prepare_body)
             .add_observer(contacts::forget_body)
-            .add_observer(contacts::tell_fixed)
+            .add_observer(contacts::fill_fixed)
             .add_systems(
                 self.schedule,
                 (

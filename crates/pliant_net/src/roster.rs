@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use bevy::prelude::*;
 use pliant_stream::{DisconnectReason, Role, UserId};
 
-use crate::session::{SessionEvent, tell};
+use crate::session::{SessionEvent, queue_event};
 use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself};
 
 /// The entities of the users in the session.
@@ -43,7 +43,7 @@ impl Roster {
         let entity = self.meet(world, id, name, role);
         let name = name_of(world, entity);
         info!("{name} {}", if back { "is back" } else { "has joined" });
-        tell(world, SessionEvent::UserJoined(UserJoined { entity, id, name, back }));
+        queue_event(world, SessionEvent::UserJoined(UserJoined { entity, id, name, back }));
         entity
     }
 
@@ -54,7 +54,7 @@ impl Roster {
         let name = name_of(world, entity);
         info!("{name} has left: {reason}");
         world.try_despawn(entity).ok();
-        tell(world, SessionEvent::UserLeft(UserLeft { id, name, reason }));
+        queue_event(world, SessionEvent::UserLeft(UserLeft { id, name, reason }));
         true
     }
 

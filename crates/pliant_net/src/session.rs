@@ -43,7 +43,7 @@ use crate::user::{UserJoined, UserLeft};
 ///     commands.join_session(pasted, JoinConfig::default());
 /// }
 /// # };
-/// fn tell(failed: On<SessionFailed>) {
+/// fn report(failed: On<SessionFailed>) {
 ///     println!("{}", failed.reason);
 /// }
 /// ```
@@ -362,7 +362,7 @@ fn take_requests(world: &mut World) {
         match request {
             Request::Begin(opened) => begin(world, opened),
             Request::Open(open) => open_apart(world, open),
-            Request::Fail(error) => tell(world, SessionEvent::failed(error)),
+            Request::Fail(error) => queue_event(world, SessionEvent::failed(error)),
             Request::Leave => {}
         }
     }
@@ -416,9 +416,9 @@ fn begin(world: &mut World, opened: Opened) {
         Opened::Host(config, carrier) => match NetHost::start(world, carrier, &config) {
             Ok(()) => {
                 let joined = SessionJoined { user: UserId::HOST, reconnected: false };
-                tell(world, SessionEvent::Joined(joined));
+                queue_event(world, SessionEvent::Joined(joined));
             }
-            Err(error) => tell(world, SessionEvent::failed(error.into())),
+            Err(error) => queue_event(world, SessionEvent::failed(error.into())),
         },
         Opened::Guest(guest) => world.insert_resource(*guest),
         Opened::Peer(peer) => world.insert_resource(*peer),
@@ -479,8 +479,8 @@ fn at_rest(body: &Body, visual: Vec<f64>) -> Result<State, StepError> {
     Ok(State { q: visual, z, s: vec![0.0; before.s.len()], frame, ..zero })
 }
 
-/// Keeps what is told of the session until no session is taken out of the world.
-pub(crate) fn tell(world: &mut World, event: SessionEvent) {
+/// Queues an event of the session. It is published when all sessions are back in the world.
+pub(crate) fn queue_event(world: &mut World, event: SessionEvent) {
     if let Some(mut control) = world.get_resource_mut::<SessionControl>() {
         control.events.push(event);
     }

@@ -34,7 +34,7 @@ pub(crate) struct Collector {
     texts: Due,
     bodies: HashMap<Entity, Followed>,
     /// Whether there are new bodies that no frame contains yet.
-    untold: bool,
+    unsent_bodies: bool,
     had_hands: bool,
     /// The diagnostics that were recorded.
     measured: HashMap<DiagnosticPath, Measured>,
@@ -132,7 +132,7 @@ impl Collector {
             modes: Due::NEVER,
             texts: Due::NEVER,
             bodies: HashMap::new(),
-            untold: false,
+            unsent_bodies: false,
             had_hands: false,
             measured: HashMap::new(),
             order: Vec::new(),
@@ -278,7 +278,7 @@ pub(crate) fn collect(
         }
     }
 
-    if std::mem::take(&mut collector.untold) {
+    if std::mem::take(&mut collector.unsent_bodies) {
         frame.arrived.extend(collector.bodies.values().map(|followed| followed.drawn.clone()));
         frame.arrived.sort_by(|a, b| a.path.cmp(&b.path));
     }
@@ -317,7 +317,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut RecordedFrame, bodies: &
             let drawn = Arc::new(Drawn { path, model: state.model().clone(), style });
             let followed = Followed { drawn, version: 0, place: None, complete: false };
             collector.bodies.insert(entity, followed);
-            collector.untold = true;
+            collector.unsent_bodies = true;
         }
         let Some(followed) = collector.bodies.get_mut(&entity) else { continue };
         let (scale, rotation, translation) = transform.to_scale_rotation_translation();

@@ -50,13 +50,13 @@ impl SceneFile {
             asked.push((vec![Field("bodies"), Item(entry), Field("bake")], "a bake", "bake"));
         }
         asked.retain(|(.., feature)| !has(feature));
-        let told = |(path, what, feature): (Vec<Step>, &str, &str)| {
+        let missing = |(path, what, feature): (Vec<Step>, &str, &str)| {
             let message = format!(
                 "this scene asks for {what}, and this program was compiled without `{feature}` (a feature of `pliant`)"
             );
             self.error(&path, SceneErrorKind::Feature, message)
         };
-        asked.into_iter().map(told).collect()
+        asked.into_iter().map(missing).collect()
     }
 
     /// Reads the files that the scene names and reports those that are missing or invalid.

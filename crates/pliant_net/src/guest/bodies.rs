@@ -9,7 +9,7 @@ use pliant_stream::{BodyId, Placement, StepSettings};
 
 use super::{Interest, NetGuest};
 use crate::remote::{BodyArrived, BodyLeft, RemoteBody, RemoteHands};
-use crate::session::{SessionEvent, give_back, tell};
+use crate::session::{SessionEvent, give_back, queue_event};
 use crate::session_transform::transform_of;
 use crate::shared_body::SharedBody;
 use crate::view::BodyDisplay;
@@ -106,7 +106,7 @@ impl NetGuest {
                 peak: 0.0,
             },
         );
-        tell(world, SessionEvent::BodyArrived(BodyArrived { entity, name }));
+        queue_event(world, SessionEvent::BodyArrived(BodyArrived { entity, name }));
     }
 
     /// Takes what is known of an entity that has tracked a body of the lost session, or one that
@@ -191,7 +191,7 @@ impl NetGuest {
             there.remove::<(RemoteBody, RemoteHands)>();
             self.removed.push(followed);
         }
-        tell(world, SessionEvent::BodyLeft(BodyLeft { entity, name }));
+        queue_event(world, SessionEvent::BodyLeft(BodyLeft { entity, name }));
     }
 }
 

@@ -13,7 +13,7 @@ use super::source::Came;
 use super::{GuestState, NetGuest};
 use crate::remote::{GrabRefused, SessionJoined, SessionLost};
 use crate::retry::Retry;
-use crate::session::{SessionEvent, tell};
+use crate::session::{SessionEvent, queue_event};
 use crate::transport::Fingerprint;
 use crate::user::shortened;
 
@@ -160,7 +160,7 @@ impl NetGuest {
         info!("lost the connection to the host, trying again: {reason}");
         if matches!(self.state, GuestState::In { .. }) {
             self.leave_session(world);
-            tell(world, SessionEvent::Lost(SessionLost { reason }));
+            queue_event(world, SessionEvent::Lost(SessionLost { reason }));
         }
         self.state = GuestState::Lost { reason };
     }
@@ -193,7 +193,7 @@ impl NetGuest {
         self.source.close();
         self.state = GuestState::Closed { reason };
         self.leave_session(world);
-        tell(world, SessionEvent::over(self.rejoin.was_in, reason));
+        queue_event(world, SessionEvent::over(self.rejoin.was_in, reason));
     }
 
     /// Leaves the session as the app has asked. The host receives a goodbye, and the bodies are the
@@ -234,7 +234,7 @@ impl NetGuest {
                     let refused = self.grabs.iter_mut().find(|(_, sent)| sent.own.number == Some(grab));
                     if let Some((&entity, sent)) = refused {
                         sent.own.number = None;
-                        tell(world, SessionEvent::GrabRefused(GrabRefused { entity }));
+                        queue_event(world, SessionEvent::GrabRefused(GrabRefused { entity }));
                     }
                 }
                 // Both ends have stopped receiving from each other, so the guest connects again.
@@ -264,6 +264,6 @@ impl NetGuest {
         for info in others.filter(|info| info.user != user) {
             self.users.meet(world, info.user, &info.name, info.role);
         }
-        tell(world, SessionEvent::Joined(SessionJoined { user, reconnected }));
+        queue_event(world, SessionEvent::Joined(SessionJoined { user, reconnected }));
     }
 }

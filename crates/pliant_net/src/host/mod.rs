@@ -20,7 +20,7 @@ use pliant_stream::{Channel, DisconnectReason, GrabKey, GrabState, HostSession, 
 use crate::known_users::KnownUsers;
 use crate::metrics::{Ledger, NetStats};
 use crate::roster::Roster;
-use crate::session::{SessionEvent, tell};
+use crate::session::{SessionEvent, queue_event};
 use crate::transport::{
     Access, Carrier, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError, quic,
 };
@@ -177,7 +177,7 @@ impl NetHost {
         self.flush();
         self.carrier.end();
         self.users.clear(world);
-        tell(world, SessionEvent::over(true, DisconnectReason::Left));
+        queue_event(world, SessionEvent::over(true, DisconnectReason::Left));
     }
 
     /// Whether there is a link that [`set_emulation`](Self::set_emulation) changes: not over a

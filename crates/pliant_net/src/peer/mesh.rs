@@ -12,7 +12,7 @@ use pliant_stream::{Channel, DisconnectReason, PeerId, StreamError, UserId};
 use super::reconnect::may_come_back;
 use super::{NetPeer, PeerState};
 use crate::remote::SessionJoined;
-use crate::session::{SessionEvent, give_back, tell};
+use crate::session::{SessionEvent, give_back, queue_event};
 use crate::transport::{Event, Fingerprint, Invite, Role, has_called};
 use crate::user::UserLink;
 
@@ -36,7 +36,7 @@ pub(super) struct ConnectedPeer {
 
 impl ConnectedPeer {
     /// Replaces the invite's host with the address from which the peer has connected.
-    fn seen_from_here(&self, invite: Invite) -> Invite {
+    fn with_seen_address(&self, invite: Invite) -> Invite {
         let host = self.address.map_or_else(|| invite.host.clone(), |address| address.to_string());
         Invite { host, ..invite }
     }
@@ -88,11 +88,11 @@ impl NetPeer {
             return;
         }
         // The number that the peer has, or says that it has.
-        let said = other.first.as_ref().and_then(|bytes| match PeerMessage::decode(bytes) {
+        let announced = other.first.as_ref().and_then(|bytes| match PeerMessage::decode(bytes) {
             Ok(PeerMessage::Hello { user, .. }) => Some(UserId(user)),
             _ => None,
         });
-        if other.number.or(said).is_some_and(|user| self.known.is_anothers(user, &other.key)) {
+        if other.number.or(announced).is_some_and(|user| self.known.is_anothers(user, &other.key)) {
             return self.hang_up(peer, DisconnectReason::NumberTaken);
         }
         let address = self.invite_for(peer).to_string();
@@ -213,13 +213,13 @@ impl NetPeer {
             self.hang_up(peer, DisconnectReason::NumberTaken);
             return false;
         }
-        let told = address.parse::<Invite>();
-        match (&mut other.invite, told) {
+        let announced = address.parse::<Invite>();
+        match (&mut other.invite, announced) {
             // A peer that this one has called is reached where it was called, with the token that
             // it has given to this one.
-            (Some(invite), Ok(told)) => invite.token = told.token.or(invite.token),
+            (Some(invite), Ok(announced)) => invite.token = announced.token.or(invite.token),
             (Some(_), Err(_)) => {}
-            (None, Ok(told)) => other.invite = Some(other.seen_from_here(told)),
+            (None, Ok(announced)) => other.invite = Some(other.with_seen_address(announced)),
             (None, Err(_)) => {
                 self.hang_up(peer, DisconnectReason::Protocol);
                 return false;
@@ -313,7 +313,7 @@ impl NetPeer {
             match event {
                 PeerEvent::Started => {
                     if let PeerState::In { user } = self.state {
-                        tell(world, SessionEvent::Joined(SessionJoined { user, reconnected: false }));
+                        queue_event(world, SessionEvent::Joined(SessionJoined { user, reconnected: false }));
                     }
                 }
                 PeerEvent::JoinRequest { peer } => self.welcome(peer),
@@ -387,7 +387,7 @@ impl NetPeer {
         info!("the session is over: {reason}");
         let inside = matches!(self.state, PeerState::In { .. });
         self.state = PeerState::Closed { reason };
-        tell(world, SessionEvent::over(inside, reason));
+        queue_event(world, SessionEvent::over(inside, reason));
     }
 
     /// Leaves the session as the app has asked. The bodies are the app's again, the other peers

@@ -26,7 +26,7 @@ use crate::metrics::{Ledger, NetStats};
 use crate::own_grab::OwnGrab;
 use crate::remote::SessionJoined;
 use crate::roster::Roster;
-use crate::session::{SessionEvent, tell};
+use crate::session::{SessionEvent, queue_event};
 use crate::shared_body::SharedBody;
 use crate::transport::{
     Access, Emulation, Fingerprint, HostOptions, Invite, Limits, MeshCarrier, PeerStats, QuicMesh, Role,
@@ -299,7 +299,7 @@ impl NetPeer {
         }
         if founds {
             self.enter(world, user);
-            tell(world, SessionEvent::Joined(SessionJoined { user, reconnected: false }));
+            queue_event(world, SessionEvent::Joined(SessionJoined { user, reconnected: false }));
         }
     }
 
@@ -339,8 +339,8 @@ impl NetPeer {
             // Who knows obstacles fills them in.
             let added = (Driven::Remote, crate::remote::RemoteHands::default(), FixedObstacles::default());
             world.entity_mut(played.entity).insert(added);
-            if let Some(told) = world.get::<FixedObstacles>(played.entity) {
-                played.around = play::agreed_surroundings(told);
+            if let Some(fixed) = world.get::<FixedObstacles>(played.entity) {
+                played.around = play::agreed_surroundings(fixed);
             }
         }
         (self.step, self.bodies) = (step, found);

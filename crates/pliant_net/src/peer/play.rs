@@ -55,7 +55,7 @@ pub(super) fn agreed_settings(body: &Body) -> StepSettings {
 ///
 /// More than [`Surroundings::MAX_OBSTACLES`] obstacles count as none, and so does each that no
 /// machine would accept, which is decided by the agreed numbers.
-pub(super) fn agreed_surroundings(told: &FixedObstacles) -> Surroundings {
+pub(super) fn agreed_surroundings(fixed: &FixedObstacles) -> Surroundings {
     /// Resolution of lengths, m, and of quaternions: a power of two, so that rounding is exact.
     const FINE: f64 = 1.0 / 1_048_576.0;
     let round = |x: f64| (x / FINE).round() * FINE + 0.0;
@@ -77,7 +77,7 @@ pub(super) fn agreed_surroundings(told: &FixedObstacles) -> Surroundings {
         let (position, rotation) = (of.position.map(round), rotation.map(|x| sign * x + 0.0));
         FixedObstacle { shape, position, rotation }
     };
-    let obstacles = told.obstacles.iter().map(agreed);
+    let obstacles = fixed.obstacles.iter().map(agreed);
     let mut obstacles: Vec<FixedObstacle> = obstacles.filter(|o| o.check().is_ok()).collect();
     if obstacles.len() > Surroundings::MAX_OBSTACLES {
         warn!("a body of peers touches nothing: it has {} obstacles", obstacles.len());
@@ -94,7 +94,7 @@ pub(super) fn agreed_surroundings(told: &FixedObstacles) -> Surroundings {
         (kind, lengths.map(f64::to_bits), of.position.map(f64::to_bits), of.rotation.map(f64::to_bits))
     };
     obstacles.sort_by_key(key);
-    Surroundings { friction: told.friction, obstacles }
+    Surroundings { friction: fixed.friction, obstacles }
 }
 
 /// `PostUpdate`: passes the app's own grabs, and its impulses on the peers' bodies, to the session.

@@ -48,12 +48,12 @@ impl NetPeer {
         }
     }
 
-    /// Tells the others with whom this peer is connected.
+    /// Sends the other peers the list of those with whom this one is connected.
     pub(super) fn introduce(&mut self) {
         let others = self.reachable();
         let Some(session) = &mut self.session else { return };
         if let Err(error) = session.introduce(&others) {
-            debug!("the others are not told: {error}");
+            debug!("no introductions are sent: {error}");
         }
     }
 

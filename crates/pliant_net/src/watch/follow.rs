@@ -28,7 +28,7 @@ const MODELS: u64 = 256 << 20;
 /// that ended within this time first.
 const PATIENCE: Duration = Duration::from_millis(300);
 /// Pause before a track that has ended is asked for again.
-const AGAIN: Duration = Duration::from_millis(500);
+const RETRY_PAUSE: Duration = Duration::from_millis(500);
 
 /// What happens in a session that is watched.
 #[derive(Debug, Clone)]
@@ -127,10 +127,10 @@ async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sen
     let (producer, driver) = origin::Producer::new(origin::Config::default());
     tokio::task::spawn_local(moq_net::time::run(driver));
     let client = moq_net::Client::new().with_subscriber(producer.clone());
-    let told = to.clone();
+    let events = to.clone();
     let _connection = Owned::spawn(async move {
         // An app that does not read learns of the relay from what arrives.
-        relay.keep(client, move |connected| drop(told.try_send(WatchEvent::Relay(connected)))).await;
+        relay.keep(client, move |connected| drop(events.try_send(WatchEvent::Relay(connected)))).await;
     });
     let models = known.into_iter().map(|model| (model.hash(), Rc::new(OnceCell::new_with(Some(model)))));
     let models = Rc::new(RefCell::new(models.collect::<BTreeMap<_, _>>()));
@@ -159,11 +159,11 @@ impl Scene {
                     let Ok(Some(frame)) = group.read_frame().await else { continue };
                     match checked(&frame.payload).and_then(|bytes| decoded(Catalog::decode(bytes))) {
                         Ok(catalog) => self.take(catalog, &mut bodies).await,
-                        Err(wrong) => self.tell(WatchEvent::Wrong(wrong)).await,
+                        Err(wrong) => self.send(WatchEvent::Wrong(wrong)).await,
                     }
                 }
             }
-            tokio::time::sleep(AGAIN).await;
+            tokio::time::sleep(RETRY_PAUSE).await;
         }
     }
 
@@ -173,12 +173,12 @@ impl Scene {
         for id in gone {
             bodies.remove(&id);
             if !catalog.bodies.iter().any(|body| body.id == id) {
-                self.tell(WatchEvent::Gone(id)).await;
+                self.send(WatchEvent::Gone(id)).await;
             }
         }
         let new = catalog.bodies.iter().filter(|body| !bodies.contains_key(&body.id)).cloned();
         let new: Vec<CatalogBody> = new.collect();
-        self.tell(WatchEvent::Catalog(catalog)).await;
+        self.send(WatchEvent::Catalog(catalog)).await;
         for body in new {
             let _task = Owned::spawn(self.clone().follow_body(body.clone()));
             bodies.insert(body.id, Followed { body, _task });
@@ -191,16 +191,16 @@ impl Scene {
                 while let Ok(Some(mut group)) = track.next_group().await {
                     while let Ok(Some(frame)) = group.read_frame().await {
                         match checked(&frame.payload).and_then(|bytes| decoded(WatchHands::decode(bytes))) {
-                            Ok(hands) => self.tell(WatchEvent::Hands(hands)).await,
+                            Ok(hands) => self.send(WatchEvent::Hands(hands)).await,
                             Err(wrong) => {
-                                self.tell(WatchEvent::Wrong(wrong)).await;
+                                self.send(WatchEvent::Wrong(wrong)).await;
                                 break;
                             }
                         }
                     }
                 }
             }
-            tokio::time::sleep(AGAIN).await;
+            tokio::time::sleep(RETRY_PAUSE).await;
         }
     }
 
@@ -208,12 +208,12 @@ impl Scene {
         let model = loop {
             match self.model(&body).await {
                 Ok(model) => break model,
-                Err(wrong) => self.tell(WatchEvent::Wrong(wrong)).await,
+                Err(wrong) => self.send(WatchEvent::Wrong(wrong)).await,
             }
-            tokio::time::sleep(4 * AGAIN).await;
+            tokio::time::sleep(4 * RETRY_PAUSE).await;
         };
         let mut decoder = BodyDecoder::new(coordinate_steps(&model, usize::from(body.modes)));
-        self.tell(WatchEvent::Body(body.clone(), model)).await;
+        self.send(WatchEvent::Body(body.clone(), model)).await;
         let name = body_track(body.id);
         loop {
             if let Ok(mut track) = self.subscribe(&name, 2).await {
@@ -223,18 +223,18 @@ impl Scene {
                         match state {
                             Ok((_, state)) => {
                                 let state = state.clone();
-                                self.tell(WatchEvent::State(body.id, state)).await;
+                                self.send(WatchEvent::State(body.id, state)).await;
                             }
                             Err(wrong) => {
                                 // The group is over; the next one begins anew.
-                                self.tell(WatchEvent::Wrong(wrong)).await;
+                                self.send(WatchEvent::Wrong(wrong)).await;
                                 break;
                             }
                         }
                     }
                 }
             }
-            tokio::time::sleep(AGAIN).await;
+            tokio::time::sleep(RETRY_PAUSE).await;
         }
     }
 
@@ -276,7 +276,7 @@ impl Scene {
         Ok(self.broadcast.track(name)?.subscribe(wanted).await?.ordered())
     }
 
-    async fn tell(&self, event: WatchEvent) {
+    async fn send(&self, event: WatchEvent) {
         // The thread ends when the app is gone.
         let _ = self.to.send(event).await;
     }

@@ -168,13 +168,13 @@ impl HostWatch {
             .enable_all()
             .build()
             .map_err(|error| WatchError::Setup(error.to_string()))?;
-        let told = shared.clone();
+        let of_thread = shared.clone();
         let scale = step;
         thread::Builder::new()
             .name("pliant-watch".into())
             .spawn(move || {
                 let tasks = tokio::task::LocalSet::new();
-                let end = runtime.block_on(tasks.run_until(carry(relay, name, items, told, scale)));
+                let end = runtime.block_on(tasks.run_until(carry(relay, name, items, of_thread, scale)));
                 if let Err(error) = end {
                     tracing::error!("nothing more is published for watchers: {error}");
                 }
@@ -391,12 +391,12 @@ async fn carry(
     let mut bodies: BTreeMap<BodyId, Line> = BTreeMap::new();
     let mut models: BTreeMap<ModelHash, (Arc<ModalModel>, usize)> = BTreeMap::new();
     let client = moq_net::Client::new().with_publisher(&producer);
-    let told = shared.clone();
+    let stats = shared.clone();
     let connection = tokio::task::spawn_local(async move {
         relay
             .keep(client, move |connected| {
-                told.connected.store(connected, Ordering::Relaxed);
-                told.connections.fetch_add(u64::from(connected), Ordering::Relaxed);
+                stats.connected.store(connected, Ordering::Relaxed);
+                stats.connections.fetch_add(u64::from(connected), Ordering::Relaxed);
             })
             .await;
     });
