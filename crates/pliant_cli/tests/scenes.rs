@@ -6,7 +6,9 @@
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
-use std::{collections::BTreeSet, fs, path::Path, process::Command};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::{fs, process::Command};
 
 /// The crates that a package compiles for this platform with these feature arguments.
 fn crates(package: &str, features: &[&str]) -> BTreeSet<String> {
@@ -203,6 +205,24 @@ const IN_BROWSERS: [&str; 11] = [
     "pliant_panel",
 ];
 
+/// The files in the `src` of a crate, without those of tests.
+fn sources(package: &str) -> Vec<PathBuf> {
+    let mut folders = vec![Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(package).join("src")];
+    let mut found = Vec::new();
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_stem().unwrap().to_string_lossy().into_owned();
+            match path.is_dir() {
+                _ if name == "tests" || name.ends_with("_tests") => {}
+                true => folders.push(path),
+                false => found.push(path),
+            }
+        }
+    }
+    found
+}
+
 /// The lines of a source, without its tests, that name the clock of the standard library.
 ///
 /// A lint for types cannot tell: natively `bevy::platform::time::Instant` and `web_time::Instant`
@@ -243,25 +263,10 @@ fn clocks_are_those_that_browsers_have() {
     assert_eq!(standard_clocks(right), [""; 0], "what is right is found");
 
     let (mut faults, mut seen) = (Vec::new(), 0);
-    for package in IN_BROWSERS {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(package).join("src");
-        let mut folders = vec![root];
-        while let Some(folder) = folders.pop() {
-            for entry in fs::read_dir(folder).unwrap() {
-                let path = entry.unwrap().path();
-                let name = path.file_stem().unwrap().to_string_lossy().into_owned();
-                if name == "tests" || name.ends_with("_tests") {
-                    continue;
-                }
-                if path.is_dir() {
-                    folders.push(path);
-                    continue;
-                }
-                seen += 1;
-                let found = standard_clocks(&fs::read_to_string(&path).unwrap());
-                faults.extend(found.into_iter().map(|line| format!("{}: {line}", path.display())));
-            }
-        }
+    for path in IN_BROWSERS.iter().flat_map(|package| sources(package)) {
+        seen += 1;
+        let found = standard_clocks(&fs::read_to_string(&path).unwrap());
+        faults.extend(found.into_iter().map(|line| format!("{}: {line}", path.display())));
     }
     assert!(seen > 100, "only {seen} sources were found");
     assert!(
@@ -269,6 +274,37 @@ fn clocks_are_those_that_browsers_have() {
         "not bevy::platform::time::Instant or web_time::Instant:\n{}",
         faults.join("\n")
     );
+}
+
+/// Name of the public type that a line declares.
+fn public_type(line: &str) -> Option<&str> {
+    let declared = line.trim_start().strip_prefix("pub ")?;
+    let kinds = ["struct ", "enum ", "trait ", "type ", "union "];
+    let rest = kinds.iter().find_map(|kind| declared.strip_prefix(kind))?;
+    rest.split(|c: char| !c.is_alphanumeric()).next()
+}
+
+/// Tests that one name means one thing: a reader who knows a type of one crate finds no other of
+/// its name.
+#[test]
+fn no_two_crates_have_a_public_type_of_one_name() {
+    let mut crates: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for entry in fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("..")).unwrap() {
+        let entry = entry.unwrap();
+        if !entry.path().join("src").is_dir() {
+            continue;
+        }
+        let package = entry.file_name().to_string_lossy().into_owned();
+        for path in sources(&package) {
+            let text = fs::read_to_string(path).unwrap();
+            for name in text.lines().filter_map(public_type) {
+                crates.entry(name.to_owned()).or_default().insert(package.clone());
+            }
+        }
+    }
+    assert!(crates.len() > 400, "only {} public types were found", crates.len());
+    let shared: Vec<_> = crates.iter().filter(|(_, crates)| crates.len() > 1).collect();
+    assert!(shared.is_empty(), "{shared:?}");
 }
 
 #[test]
