@@ -45,7 +45,7 @@ fn host(model: &Arc<ModalModel>) -> (App, Invite) {
 }
 
 #[derive(Resource, Default)]
-struct Heard(Vec<Fault>);
+struct ReceivedFaults(Vec<Fault>);
 
 struct Guest {
     app: App,
@@ -62,10 +62,10 @@ fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
     let config =
         JoinConfig { name: "Ann".into(), transport, models: vec![model.clone()], ..JoinConfig::default() };
     let mut app = app(NetPlugin::join(invite, config).unwrap());
-    app.add_plugins(HapticsPlugin::default()).init_resource::<Heard>().add_systems(
+    app.add_plugins(HapticsPlugin::default()).init_resource::<ReceivedFaults>().add_systems(
         Update,
-        |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
-            heard.0.extend(faults.read().filter_map(|fault| fault.fault));
+        |mut faults: MessageReader<HapticFault>, mut received: ResMut<ReceivedFaults>| {
+            received.0.extend(faults.read().filter_map(|fault| fault.fault));
         },
     );
     app.world_mut().spawn((SharedBody::named("pip"), Transform::default()));
@@ -164,13 +164,13 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
 
     // The host's machine stops without a goodbye.
     std::mem::forget(host);
-    g.app.world_mut().resource_mut::<Heard>().0.clear();
+    g.app.world_mut().resource_mut::<ReceivedFaults>().0.clear();
     let mut nothing = Instant::now();
     until(&mut [&mut g.app], "the force fades, says why, and stays away", |apps| {
         if force(apps[0]) != DVec3::ZERO {
             nothing = Instant::now();
         }
-        let heard = &apps[0].world().resource::<Heard>().0;
-        nothing.elapsed() > Duration::from_secs(1) && heard.iter().any(|f| matches!(f, Fault::Stale(_)))
+        let received = &apps[0].world().resource::<ReceivedFaults>().0;
+        nothing.elapsed() > Duration::from_secs(1) && received.iter().any(|f| matches!(f, Fault::Stale(_)))
     });
 }

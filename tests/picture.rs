@@ -138,8 +138,8 @@ fn drawn_shadowed_and_pulled(mut app: App) {
         // 0.3 m of body at 0.9 m with a 45 degree lens is about a third of the height: a tenth of
         // the picture, within a factor of three.
         let right = (all / 30..all / 3).contains(&body) && lit > all / 10 && shadow > body / 20;
-        let told = || format!("{body} pixels of body, {lit} of lit ground, {shadow} of shadow, of {all}");
-        if still && right { Ok(next) } else { Err(told()) }
+        let summary = || format!("{body} pixels of body, {lit} of lit ground, {shadow} of shadow, of {all}");
+        if still && right { Ok(next) } else { Err(summary()) }
     });
 
     // An ear is pulled sideways by a quarter of the body's size.

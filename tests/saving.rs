@@ -215,7 +215,7 @@ fn a_body_waits_for_the_shapes_of_its_hands_and_goes_on_bit_for_bit() {
 }
 
 #[derive(Resource, Default)]
-struct Told(Vec<String>);
+struct Received(Vec<String>);
 
 #[test]
 fn a_state_of_another_model_is_refused_and_the_body_begins_at_rest() {
@@ -224,12 +224,14 @@ fn a_state_of_another_model_is_refused_and_the_body_begins_at_rest() {
     wait_for_bodies(&mut scene, 1);
     (0..30).for_each(|_| scene.update());
     let mut loaded = load(&save(&scene).replace("pip.modal", "bud.modal"), ASSETS);
-    loaded.init_resource::<Told>().add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
-        told.0.push(refused.error.to_string());
-    });
+    loaded.init_resource::<Received>().add_observer(
+        |refused: On<BodyRefused>, mut received: ResMut<Received>| {
+            received.0.push(refused.error.to_string());
+        },
+    );
     wait_for_bodies(&mut loaded, 1);
-    let told = &loaded.world().resource::<Told>().0;
-    assert!(matches!(&told[..], [one] if one.contains("saved state")), "{told:?}");
+    let received = &loaded.world().resource::<Received>().0;
+    assert!(matches!(&received[..], [one] if one.contains("saved state")), "{received:?}");
     let body = named(&mut loaded, "pip");
     assert!(loaded.world().get::<BodyState>(body).unwrap().body().q().iter().all(|q| *q == 0.0));
     (0..30).for_each(|_| loaded.update());

@@ -329,8 +329,8 @@ impl Star {
             assert!(guest.bodies().all(|view| view.visual().is_none_or(|shown| shown.is_finite())));
             let Some(view) = guest.body(BODY) else { continue };
             for grab in 0..4 {
-                let told = user.and_then(|user| view.hand_reaction(user, grab));
-                assert!(told.is_none_or(|told| told.iter().all(|x| x.is_finite())));
+                let reaction = user.and_then(|user| view.hand_reaction(user, grab));
+                assert!(reaction.is_none_or(|reaction| reaction.iter().all(|x| x.is_finite())));
             }
         }
         assert!(self.host.users().count() <= self.guests.len() && self.held.len() <= 16 * self.guests.len());

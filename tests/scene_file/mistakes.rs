@@ -50,7 +50,7 @@ fn what_is_no_ron_is_told_where_it_ends_to_be_one() {
     let error = with("stiffness: 200", "stiffness: \"200\"");
     assert_eq!((error.position, error.kind), (Some((9, 74)), SceneErrorKind::Syntax), "{error}");
     assert_eq!(error.message, "expected a number, got `\"200\"`");
-    for (part, by, told) in [
+    for (part, by, expected) in [
         ("model: \"pip.modal\"", "model: pip.modal", "expected text in double quotes, got `pip.modal`"),
         ("model: \"pip.modal\"", "model: \"pip.modal\", modes: 3.5", "expected a whole number, got `.5`"),
         (
@@ -65,7 +65,7 @@ fn what_is_no_ron_is_told_where_it_ends_to_be_one() {
             "expected an opening bracket (what has parts has brackets of its own, such as `Toward((1, 0, 0))`), got `1`",
         ),
     ] {
-        assert_eq!(with(part, by).message, told);
+        assert_eq!(with(part, by).message, expected);
     }
     let open = &GOOD[..GOOD.find(",\n    ],\n    grabs").unwrap()];
     assert_eq!(refused(open).message, "expected a comma or a closing bracket, got the end of the file");
@@ -180,13 +180,13 @@ fn a_bake_of_a_scene_has_the_defaults_of_a_bake_and_refuses_what_its_material_do
     let (got, wanted) = (scene.scene().bodies[0].bake.clone().unwrap(), pliant::bake::BakeConfig::default());
     assert_eq!((got.modes, got.material), (wanted.modes, wanted.material_name()));
     assert_eq!((got.young, got.poisson, got.density), (wanted.young, wanted.poisson, wanted.density));
-    for (rest, told) in [
+    for (rest, expected) in [
         (", material: \"rubber\"", "`neo-hookean`, `st-venant-kirchhoff` or `linear`"),
         (", poisson: 0.49", "a Poisson ratio from -0.99 to 0.45"),
         (", modes: 121", "modes from 1 to 120"),
     ] {
         let error = baked(rest).unwrap_err();
-        assert!(error.to_string().contains(told), "{error}");
+        assert!(error.to_string().contains(expected), "{error}");
     }
     assert!(baked(", material: \"linear\", poisson: 0.49, modes: 121").is_ok());
 }

@@ -23,12 +23,17 @@ fn each_entry_needs_its_feature_and_no_other() {
         let file = SceneFile::from_ron(&GOOD.replacen(part, by, 1), "my.ron").unwrap();
         assert_eq!(file.lacking(|_| true), [], "{feature}");
         assert_eq!(file.lacking(|has| has == feature), [], "nothing but {feature} is needed");
-        let told = file.lacking(|has| has != feature);
-        assert_eq!(told.len(), 1, "{told:?}");
-        assert_eq!((told[0].position, told[0].kind), (Some(place), SceneErrorKind::Feature), "{}", told[0]);
+        let errors = file.lacking(|has| has != feature);
+        assert_eq!(errors.len(), 1, "{errors:?}");
+        assert_eq!(
+            (errors[0].position, errors[0].kind),
+            (Some(place), SceneErrorKind::Feature),
+            "{}",
+            errors[0]
+        );
         let expected =
             format!("this scene asks for {what}, and this program was compiled without `{feature}`");
-        assert!(told[0].message.starts_with(&expected), "{}", told[0]);
+        assert!(errors[0].message.starts_with(&expected), "{}", errors[0]);
     }
 }
 
@@ -59,18 +64,21 @@ fn a_recording_that_cannot_be_written_is_told_before_the_scene_plays() {
         SceneFile::from_ron(&text, "my.ron").unwrap()
     };
     let file = wrong("no/such folder/out.rrd");
-    let told = file.check_files(ASSETS);
-    assert_eq!(told.len(), 1, "{told:?}");
-    assert_eq!((told[0].position, told[0].kind), (Some((2, 23)), SceneErrorKind::Open));
-    assert_eq!(told[0].message, "cannot record to no/such folder/out.rrd: there is no folder no/such folder");
+    let errors = file.check_files(ASSETS);
+    assert_eq!(errors.len(), 1, "{errors:?}");
+    assert_eq!((errors[0].position, errors[0].kind), (Some((2, 23)), SceneErrorKind::Open));
+    assert_eq!(
+        errors[0].message,
+        "cannot record to no/such folder/out.rrd: there is no folder no/such folder"
+    );
     #[cfg(feature = "rerun")]
-    assert_eq!(SceneFilePlugin::open(file).err(), Some(told[0].clone()));
+    assert_eq!(SceneFilePlugin::open(file).err(), Some(errors[0].clone()));
     // The path itself is a folder, and it has no parent folder that could be missing.
     let folder = format!("pliant-scene-{}.rrd", std::process::id());
     std::fs::create_dir(&folder).unwrap();
-    let told = wrong(&folder).check_files(ASSETS);
+    let errors = wrong(&folder).check_files(ASSETS);
     std::fs::remove_dir(&folder).unwrap();
-    assert!(told[0].message.ends_with(": it is a folder"), "{told:?}");
+    assert!(errors[0].message.ends_with(": it is a folder"), "{errors:?}");
     assert_eq!(wrong("out.rrd").check_files(ASSETS), []);
     assert!(!std::path::Path::new("out.rrd").exists(), "a check makes no file");
 }
@@ -83,9 +91,9 @@ fn missing_files_are_told_by_a_check_with_their_lines() {
         "bake: (shape: \"jelly.obi\")",
         1,
     );
-    let told = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
+    let errors = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
     let lines: Vec<String> =
-        told.iter().map(|error| error.to_string().lines().next().unwrap().to_owned()).collect();
+        errors.iter().map(|error| error.to_string().lines().next().unwrap().to_owned()).collect();
     assert_eq!(lines.len(), 2, "{lines:#?}");
     assert!(
         lines[0].starts_with("my.ron:4:30: the body `pip` cannot be loaded: there is no pop.modal in "),
@@ -99,7 +107,7 @@ fn missing_files_are_told_by_a_check_with_their_lines() {
         lines[1]
     );
     assert!(lines[1].ends_with("; did you mean `jelly.obj`?"), "{}", lines[1]);
-    assert!(told.iter().all(|error| error.kind == SceneErrorKind::Asset));
+    assert!(errors.iter().all(|error| error.kind == SceneErrorKind::Asset));
     // The file exists, but it is not a model.
     let text = GOOD.replacen("model: \"bud.modal\"", "model: \"../Cargo.toml\"", 1);
     assert!(SceneFile::from_ron(&text, "my.ron").is_err());
@@ -107,17 +115,17 @@ fn missing_files_are_told_by_a_check_with_their_lines() {
     std::fs::create_dir_all(&folder).unwrap();
     std::fs::write(folder.join("pip.modal"), "nothing that was baked").unwrap();
     std::fs::copy(format!("{ASSETS}/bud.modal"), folder.join("bud.modal")).unwrap();
-    let told = SceneFile::from_ron(GOOD, "my.ron").unwrap().check_files(&folder);
+    let errors = SceneFile::from_ron(GOOD, "my.ron").unwrap().check_files(&folder);
     std::fs::remove_dir_all(&folder).unwrap();
-    assert_eq!((told.len(), told[0].position), (1, Some((4, 30))), "{told:?}");
+    assert_eq!((errors.len(), errors[0].position), (1, Some((4, 30))), "{errors:?}");
     // The model does not have this vertex.
     let text = GOOD.replacen("Toward((1, 0, 0))", "Vertex(4000000)", 1);
-    let told = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
-    assert_eq!((told.len(), told[0].position), (1, Some((8, 44))), "{told:?}");
+    let errors = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
+    assert_eq!((errors.len(), errors[0].position), (1, Some((8, 44))), "{errors:?}");
     assert!(
-        told[0].message.starts_with("the grab `left` cannot hold `pip`: expected a vertex"),
+        errors[0].message.starts_with("the grab `left` cannot hold `pip`: expected a vertex"),
         "{}",
-        told[0]
+        errors[0]
     );
 }
 

@@ -100,9 +100,9 @@ fn a_file_of_the_scene_that_is_not_there_is_told_with_its_entry_and_line() {
         !errors.is_empty()
     });
     assert_eq!(errors.len(), 1, "{errors:?}");
-    let told = errors[0].to_string();
-    assert!(told.starts_with("my.ron:5:30: the body `bud` cannot be loaded: "), "{told}");
-    assert!(told.contains("bad.modal"), "{told}");
+    let message = errors[0].to_string();
+    assert!(message.starts_with("my.ron:5:30: the body `bud` cannot be loaded: "), "{message}");
+    assert!(message.contains("bad.modal"), "{message}");
     assert_eq!(errors[0].kind, SceneErrorKind::Asset);
     // The other body is held regardless of the failure.
     run_until(&mut app, "the hands", |world| world.query::<(&Grab, &GrabForce)>().iter(world).count() == 2);
@@ -123,12 +123,12 @@ fn a_vertex_that_the_body_does_not_have_is_told_once() {
         errors.extend(failures(app.world_mut()));
     }
     assert_eq!(errors.len(), 1, "{errors:?}");
-    let told = errors[0].to_string();
+    let message = errors[0].to_string();
     assert!(
-        told.starts_with(
+        message.starts_with(
             "my.ron:8:44: the grab `left` cannot hold `pip`: expected a vertex of the surface, 0 to "
         ),
-        "{told}"
+        "{message}"
     );
 }
 
@@ -208,9 +208,9 @@ fn the_project_s_scenes_may_be_assets_of_a_game() {
         let handle: Handle<SceneFile> = app.world().resource::<AssetServer>().load(scene);
         app.world_mut().spawn(SceneInstance(handle)).id()
     });
-    let mut told = Vec::new();
+    let mut failures = Vec::new();
     run_until(&mut app, "the bodies and the clocks", |world| {
-        told.extend(world.resource_mut::<Messages<SceneFailed>>().drain());
+        failures.extend(world.resource_mut::<Messages<SceneFailed>>().drain());
         let begun = |at: &Entity| world.get::<SceneClock>(*at).is_some_and(|clock| clock.at(0.0).is_some());
         instances.iter().all(begun)
     });
@@ -218,7 +218,7 @@ fn the_project_s_scenes_may_be_assets_of_a_game() {
         app.update();
     }
     let of = |instance| -> Vec<String> {
-        told.iter().filter(|one| one.instance == instance).map(|one| one.error.message.clone()).collect()
+        failures.iter().filter(|one| one.instance == instance).map(|one| one.error.message.clone()).collect()
     };
     let shared = of(instances[0]);
     assert_eq!(shared.len(), 1, "{shared:#?}");
@@ -362,14 +362,14 @@ fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
     // Four times the stiffness doubles the frequency.
     assert!((of("pip").3 - 2.0).abs() < 1e-9, "{bodies:?}");
     assert_eq!((of("bud").1, of("bud").2), (1.0, false));
-    for (settings, column, told) in [
+    for (settings, column, message) in [
         ("stiffness_scale: 0", 71, "stiffness_scale: expected 1e-6 to 1e6, got 0"),
         ("relaxation: (ratio: 1, time: 2)", 74, "relaxation ratio: expected 0 or more, below 1, got 1"),
         ("integrator: GeneralizedAlpha(rho_inf: 2)", 92, "rho_inf: expected 0 to 1, got 2"),
     ] {
         let settings = format!("model: \"pip.modal\", settings: ({settings})");
         let error = with("model: \"pip.modal\"", &settings);
-        assert_eq!((error.position, error.message.as_str()), (Some((4, column)), told));
+        assert_eq!((error.position, error.message.as_str()), (Some((4, column)), message));
     }
 }
 

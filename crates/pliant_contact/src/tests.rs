@@ -34,7 +34,7 @@ static CUBE: LazyLock<Arc<ModalModel>> = LazyLock::new(|| {
 });
 
 #[derive(Resource, Default)]
-struct Told {
+struct Received {
     started: Vec<ContactStarted>,
     ended: Vec<ContactEnded>,
     refused: Vec<String>,
@@ -50,11 +50,13 @@ fn app_with(plugins: impl FnOnce(&mut App)) -> App {
         .insert_resource(Time::<Fixed>::from_seconds(STEP))
         .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
         .add_plugins((PliantBodyPlugin::default(), ContactPlugin::default()))
-        .init_resource::<Told>()
-        .add_observer(|event: On<ContactStarted>, mut told: ResMut<Told>| told.started.push(*event))
-        .add_observer(|event: On<ContactEnded>, mut told: ResMut<Told>| told.ended.push(*event))
-        .add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
-            told.refused.push(refused.error.to_string());
+        .init_resource::<Received>()
+        .add_observer(|event: On<ContactStarted>, mut received: ResMut<Received>| {
+            received.started.push(*event)
+        })
+        .add_observer(|event: On<ContactEnded>, mut received: ResMut<Received>| received.ended.push(*event))
+        .add_observer(|refused: On<BodyRefused>, mut received: ResMut<Received>| {
+            received.refused.push(refused.error.to_string());
         });
     plugins(&mut app);
     app.finish();
@@ -104,13 +106,13 @@ fn a_body_falls_on_a_floor_and_rests_there() {
     assert!((height - 0.3 - 0.5 * EDGE).abs() < 0.02 * EDGE, "the center is at {height}");
     assert!(contacts(&app, body).0.iter().all(|c| c.other == floor && c.penetration < 2e-3 * EDGE));
     assert!(state(&app, body).is_resting());
-    let told = app.world().resource::<Told>();
-    let first = told.started[0];
+    let received = app.world().resource::<Received>();
+    let first = received.started[0];
     assert!((first.entity, first.other, first.normal) == (body, floor, DVec3::Y));
     // It fell by 0.1 m, and no more than doubles its momentum in the first step of the contact.
     let momentum = CUBE.mass() * (2.0 * GRAVITY * 0.1).sqrt();
     assert!(first.impulse.y > 0.0 && first.impulse.y < 2.1 * momentum, "{}", first.impulse);
-    assert_eq!(told.started.len(), told.ended.len() + 1);
+    assert_eq!(received.started.len(), received.ended.len() + 1);
 }
 
 #[test]
@@ -124,7 +126,7 @@ fn a_resting_body_falls_when_its_floor_goes() {
     seconds(&mut app, 0.5);
     let fallen = center(&app, body).y;
     assert!((fallen - 0.1 + 0.5 * GRAVITY * 0.25).abs() < 0.1, "{fallen}");
-    assert!(app.world().resource::<Told>().ended.iter().any(|ended| ended.other == floor));
+    assert!(app.world().resource::<Received>().ended.iter().any(|ended| ended.other == floor));
     assert!(contacts(&app, body).0.is_empty());
 }
 
@@ -195,9 +197,9 @@ fn an_obstacle_without_a_number_is_refused_once_and_touches_nothing() {
     let body = spawn(&mut app, Transform::from_xyz(0.0, 0.3, 0.0), BodyFriction(-1.0));
     seconds(&mut app, 0.5);
     assert!(center(&app, body).y < -0.5);
-    let told = &app.world().resource::<Told>().refused;
-    assert_eq!(told.iter().filter(|told| told.contains("radius")).count(), 1, "{told:?}");
-    assert_eq!(told.iter().filter(|told| told.contains("friction")).count(), 1, "{told:?}");
+    let received = &app.world().resource::<Received>().refused;
+    assert_eq!(received.iter().filter(|received| received.contains("radius")).count(), 1, "{received:?}");
+    assert_eq!(received.iter().filter(|received| received.contains("friction")).count(), 1, "{received:?}");
 }
 
 #[test]
@@ -240,7 +242,7 @@ fn a_box_that_moves_beside_a_resting_body_does_not_wake_it_and_one_that_comes_to
     let pushed = center(&app, body).x;
     println!("pushed by {pushed} m");
     assert!((pushed + 0.018).abs() < 2e-3, "{pushed}");
-    assert!(app.world().resource::<Told>().refused.is_empty());
+    assert!(app.world().resource::<Received>().refused.is_empty());
 }
 
 #[test]
@@ -293,9 +295,9 @@ fn bodies_rest_on_each_other_and_wake_together() {
     let of = |other| contacts(&app, below).0.iter().filter(move |c| c.other == other).map(|c| c.force);
     let (up, down): (DVec3, DVec3) = (of(floor).sum(), of(above).sum());
     assert!((down + force).length() < 1e-9 * weight() && (up.y / weight() - 2.0).abs() < 1e-3, "{up} {down}");
-    let told = app.world().resource::<Told>();
-    let told = |entity, other| told.started.iter().any(|e| (e.entity, e.other) == (entity, other));
-    assert!(told(above, below) && told(below, above) && told(below, floor));
+    let received = app.world().resource::<Received>();
+    let received = |entity, other| received.started.iter().any(|e| (e.entity, e.other) == (entity, other));
+    assert!(received(above, below) && received(below, above) && received(below, floor));
     // What lies on a body that is moved away falls.
     app.world_mut().get_mut::<Transform>(below).unwrap().translation.x = 5.0;
     seconds(&mut app, 1.0);
@@ -332,14 +334,14 @@ fn who_steps_a_body_elsewhere_is_told_what_stands_still() {
     let own = (BodyFriction(0.3), ContactLayers { memberships: 1, ..default() });
     let body = spawn(&mut app, Transform::from_xyz(0.0, 1.0, 0.0).with_scale(Vec3::splat(2.0)), own);
     seconds(&mut app, 0.1);
-    let told = |app: &mut App| {
+    let received = |app: &mut App| {
         app.world_mut().entity_mut(body).insert(FixedObstacles::default());
         app.world().get::<FixedObstacles>(body).unwrap().clone()
     };
-    assert_eq!(told(&mut app).obstacles.len(), 3);
+    assert_eq!(received(&mut app).obstacles.len(), 3);
     app.world_mut().get_mut::<Transform>(moves).unwrap().translation.x += 0.01;
     app.update();
-    let FixedObstacles { friction, obstacles } = told(&mut app);
+    let FixedObstacles { friction, obstacles } = received(&mut app);
     // In the world of the body, in which all lengths are halved.
     let ball = FixedObstacle {
         shape: FixedShape::Ball { radius: 0.25 },

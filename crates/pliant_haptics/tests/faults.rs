@@ -273,7 +273,7 @@ impl HapticDevice for Liar {
 
 /// Runs a spring of 200 N/m that a firm hand stretches by 1 cm, with `lie` for `ticks` periods and
 /// without it before and after.
-fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
+fn run_with(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
     let device = VirtualDevice::new(VirtualConfig::touch(), HandModel::FIRM).unwrap();
     let hand = device.handle();
     hand.set_target([0.014, 0.0, 0.0]);
@@ -301,7 +301,7 @@ fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
 
 #[test]
 fn not_a_number_from_the_device() {
-    let (cycle, events, lowest, step) = told(Lie::NotANumber, 60);
+    let (cycle, events, lowest, step) = run_with(Lie::NotANumber, 60);
     assert!(events.contains(&LoopEvent::Fault(Fault::NotFinite)));
     assert_eq!(lowest, 0.0, "faded within 60 ms");
     assert!(cycle.core().last().wrench.force[0] < -1.0, "and back: {:?}", cycle.core().last().wrench);
@@ -312,7 +312,7 @@ fn not_a_number_from_the_device() {
 fn a_velocity_that_overflows() {
     // The velocity is finite, but its square is not. Both one such sample and many are tested.
     for ticks in [1, 60] {
-        let (mut cycle, events, lowest, step) = told(Lie::Wild, ticks);
+        let (mut cycle, events, lowest, step) = run_with(Lie::Wild, ticks);
         assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::TooFast(v)) if *v == 1e200)));
         assert!(lowest.is_finite() && (ticks == 1 || lowest == 0.0), "faded: {lowest} N");
         assert!(cycle.core().last().wrench.force[0] < -1.0, "and back: {:?}", cycle.core().last().wrench);
@@ -325,7 +325,7 @@ fn a_velocity_that_overflows() {
 
 #[test]
 fn a_jump_of_a_meter() {
-    let (cycle, events, lowest, step) = told(Lie::Elsewhere, 500);
+    let (cycle, events, lowest, step) = run_with(Lie::Elsewhere, 500);
     assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Jump(d)) if (d - 1.0).abs() < 0.01)));
     assert!(lowest < 1e-9);
     assert!(step <= slew_per_tick() * 1.000_001, "{step}");
@@ -338,7 +338,7 @@ fn a_jump_of_a_meter() {
 #[test]
 fn a_driver_that_fails_each_tick() {
     for lie in [Lie::Error, Lie::ErrorAtOnce] {
-        let (cycle, events, lowest, step) = told(lie, 1500);
+        let (cycle, events, lowest, step) = run_with(lie, 1500);
         assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Driver(_)))));
         assert!(events.contains(&LoopEvent::Lost), "after 100 ms it counts as lost");
         assert!(events.contains(&LoopEvent::Returned));
@@ -461,9 +461,9 @@ fn a_driver_that_panics() {
         let bomb = Bomb { inner, panic: panic.clone(), stopped: stopped.clone(), twice };
         let mut running = HapticLoop::start(bomb, machine::patient()).unwrap();
         let mut tick = 0;
-        let mut heard: Vec<LoopEvent> = Vec::new();
+        let mut received: Vec<LoopEvent> = Vec::new();
         let mut until = |running: &mut HapticLoop,
-                         heard: &mut Vec<LoopEvent>,
+                         received: &mut Vec<LoopEvent>,
                          what: &str,
                          so: &dyn Fn(&LoopReport) -> bool| {
             machine::until(what, || {
@@ -473,36 +473,36 @@ fn a_driver_that_panics() {
                     model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
                 });
                 std::thread::sleep(Duration::from_millis(10));
-                heard.extend(running.events());
+                received.extend(running.events());
                 let report = running.report();
                 if so(report) { Ok(()) } else { Err(Box::new((report.state, report.tick))) }
             });
         };
-        until(&mut running, &mut heard, "a force", &|r| r.tick.wrench.force[0] < -0.5);
+        until(&mut running, &mut received, "a force", &|r| r.tick.wrench.force[0] < -0.5);
         hand.set_buttons(1);
-        until(&mut running, &mut heard, "a force and a button", &|r| {
+        until(&mut running, &mut received, "a force and a button", &|r| {
             r.tick.wrench.force[0] < -0.5 && r.tick.buttons == 1
         });
         assert_eq!(running.report().state, LoopState::Running);
         panic.store(true, Ordering::Release);
-        until(&mut running, &mut heard, "the end", &|r| r.state == LoopState::Ended);
-        heard.extend(running.events());
+        until(&mut running, &mut received, "the end", &|r| r.state == LoopState::Ended);
+        received.extend(running.events());
         let report = *running.report();
         assert_eq!(report.tick.wrench, Wrench::ZERO, "nobody is told of a force that is not there");
         assert_eq!((report.tick.gain, report.tick.buttons, report.rate), (0.0, 0, 0.0));
         assert_eq!(report.tick.fault, Some(Fault::Panicked));
         assert_eq!(report.faults[Fault::Panicked.kind()], 1);
         assert!(stopped.load(Ordering::Acquire) >= 1, "and the device was told to let go");
-        let last: Vec<_> = heard.iter().rev().take(3).rev().copied().collect();
+        let last: Vec<_> = received.iter().rev().take(3).rev().copied().collect();
         assert_eq!(
             last,
             [LoopEvent::Released(0), LoopEvent::Fault(Fault::Panicked), LoopEvent::Lost],
-            "{heard:?}"
+            "{received:?}"
         );
         // The events are sent only once, and the state is final.
-        heard.clear();
-        until(&mut running, &mut heard, "another look", &|_| true);
-        assert_eq!(heard, []);
+        received.clear();
+        until(&mut running, &mut received, "another look", &|_| true);
+        assert_eq!(received, []);
         assert_eq!(running.report().state, LoopState::Ended);
     }
 }

@@ -25,7 +25,7 @@ fn random(seed: &mut u64) -> f64 {
 
 /// What a session showed.
 #[derive(Debug, Default)]
-struct Felt {
+struct Displayed {
     hitches: u32,
     /// Largest force, N.
     force: f64,
@@ -39,11 +39,11 @@ struct Felt {
 }
 
 /// Runs a session in which the hand drags the body about. The simulation hitches if it `hitches`.
-fn session(device: VirtualConfig, modal: bool, hitches: bool, mut seed: u64) -> Felt {
+fn session(device: VirtualConfig, modal: bool, hitches: bool, mut seed: u64) -> Displayed {
     let config = SceneConfig { modes: 12, hand: HandModel::FIRM, device, modal, ..SceneConfig::default() };
     let mut scene = Scene::new(config);
     let limit = SafetyConfig::for_device(scene.cycle.core().info(), 1000.0).slew.unwrap() * 1e-3;
-    let mut felt = Felt::default();
+    let mut displayed = Displayed::default();
     // Time to the next change between a simulation that runs and one that stands still, s.
     let mut left = 0.8;
     let mut last = Vector3::zeros();
@@ -57,7 +57,7 @@ fn session(device: VirtualConfig, modal: bool, hitches: bool, mut seed: u64) -> 
         left -= 1e-3;
         if hitches && left <= 0.0 {
             scene.silent = !scene.silent;
-            felt.hitches += u32::from(scene.silent);
+            displayed.hitches += u32::from(scene.silent);
             let share = random(&mut seed);
             left = if scene.silent { 0.05 + 0.95 * share * share } else { 0.05 + 0.75 * share };
             if scene.silent && random(&mut seed) < 0.25 {
@@ -68,16 +68,16 @@ fn session(device: VirtualConfig, modal: bool, hitches: bool, mut seed: u64) -> 
         scene.tick();
         let force = Vector3::from(scene.cycle.core().last().wrench.force);
         let periods = (scene.scheduler.last().dt * 1e3).max(1.0);
-        felt.rise = felt.rise.max((force.norm() - last.norm()) / limit);
-        felt.change = felt.change.max((force - last).norm() / (periods * limit));
-        felt.force = felt.force.max(force.norm());
+        displayed.rise = displayed.rise.max((force.norm() - last.norm()) / limit);
+        displayed.change = displayed.change.max((force - last).norm() / (periods * limit));
+        displayed.force = displayed.force.max(force.norm());
         last = force;
         let silent = scene.cycle.core().last().silent;
         if silent > FADED {
-            felt.late = felt.late.max(force.norm());
+            displayed.late = displayed.late.max(force.norm());
         }
     }
-    felt
+    displayed
 }
 
 #[test]
@@ -88,12 +88,15 @@ fn a_simulation_that_hitches_fades_and_never_kicks() {
             for seed in 1..=8 {
                 let what = format!("{name}, modal: {modal}, seed {seed}");
                 let truth = session(device.clone(), modal, false, seed);
-                let felt = session(device.clone(), modal, true, seed);
-                println!("{what}: {felt:.3?}, and {:.3} N without hitches", truth.force);
-                assert!(felt.hitches > 10 && felt.force > 0.5, "{what}: {felt:?}");
-                assert!(felt.rise <= 1.000_001 && felt.change <= 1.000_001, "{what}: {felt:?}");
-                assert_eq!(felt.late, 0.0, "{what}: {felt:?}");
-                assert!(felt.force <= 1.2 * truth.force, "{what}: {felt:?} of {} N", truth.force);
+                let displayed = session(device.clone(), modal, true, seed);
+                println!("{what}: {displayed:.3?}, and {:.3} N without hitches", truth.force);
+                assert!(displayed.hitches > 10 && displayed.force > 0.5, "{what}: {displayed:?}");
+                assert!(
+                    displayed.rise <= 1.000_001 && displayed.change <= 1.000_001,
+                    "{what}: {displayed:?}"
+                );
+                assert_eq!(displayed.late, 0.0, "{what}: {displayed:?}");
+                assert!(displayed.force <= 1.2 * truth.force, "{what}: {displayed:?} of {} N", truth.force);
             }
         }
     }

@@ -190,7 +190,7 @@ fn a_press_holds_and_the_hand_feels_the_body() {
 }
 
 #[derive(Resource, Default)]
-struct Heard(Vec<Fault>);
+struct ReceivedFaults(Vec<Fault>);
 
 #[test]
 fn pause_fades_and_stop_is_latched() {
@@ -199,14 +199,17 @@ fn pause_fades_and_stop_is_latched() {
     until(&mut s, "gripped", |s| grabs(&mut s.app).len() == 1);
     s.hand.set_target([0.02, 0.0, 0.0]);
     until(&mut s, "a force", |s| force(s).length() > 1.0);
-    s.app.insert_resource(Heard::default());
-    s.app.add_systems(Update, |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
-        heard.0.extend(faults.read().filter_map(|f| f.fault));
-    });
+    s.app.insert_resource(ReceivedFaults::default());
+    s.app.add_systems(
+        Update,
+        |mut faults: MessageReader<HapticFault>, mut received: ResMut<ReceivedFaults>| {
+            received.0.extend(faults.read().filter_map(|f| f.fault));
+        },
+    );
     s.app.world_mut().resource_mut::<Time<Virtual>>().pause();
     until(&mut s, "a paused game pushes nobody, and says why", |s| {
-        let heard = &s.app.world().resource::<Heard>().0;
-        heard.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
+        let received = &s.app.world().resource::<ReceivedFaults>().0;
+        received.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
     });
     s.app.world_mut().resource_mut::<Time<Virtual>>().unpause();
     until(&mut s, "it comes back", |s| force(s).length() > 1.0);
@@ -222,8 +225,8 @@ fn pause_fades_and_stop_is_latched() {
     #[derive(Resource, Default)]
     struct Buttons(Vec<HapticButton>);
     s.app.init_resource::<Buttons>();
-    s.app.add_systems(Update, |mut news: MessageReader<HapticButton>, mut told: ResMut<Buttons>| {
-        told.0.extend(news.read());
+    s.app.add_systems(Update, |mut events: MessageReader<HapticButton>, mut buttons: ResMut<Buttons>| {
+        buttons.0.extend(events.read());
     });
     s.run(2);
     s.app.world_mut().resource_mut::<Buttons>().0.clear();
@@ -380,7 +383,7 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     world.entity_mut(grab).insert(known);
     #[derive(Resource)]
     struct Network(bool);
-    s.app.insert_resource(Network(true)).insert_resource(Heard::default());
+    s.app.insert_resource(Network(true)).insert_resource(ReceivedFaults::default());
     s.app.add_systems(
         PostUpdate,
         |network: Res<Network>, mut shown: Query<&mut pliant_body::VisualState>| {
@@ -390,9 +393,12 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
             }
         },
     );
-    s.app.add_systems(Update, |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
-        heard.0.extend(faults.read().filter_map(|f| f.fault));
-    });
+    s.app.add_systems(
+        Update,
+        |mut faults: MessageReader<HapticFault>, mut received: ResMut<ReceivedFaults>| {
+            received.0.extend(faults.read().filter_map(|f| f.fault));
+        },
+    );
     s.hand.set_target([0.01, 0.0, 0.0]);
     // The coupling (280 N/m) and the arm (500 N/m) are in series over 1 cm. The compliance of the
     // patch itself is a hundredth of that. Friction may hold back 0.26 N.
@@ -407,11 +413,11 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     until(&mut s, "let go", |s| force(s) == DVec3::ZERO);
     s.app.world_mut().entity_mut(grab).insert(known);
     until(&mut s, "held again", |s| (force(s).x - want).abs() < 0.3);
-    s.app.world_mut().resource_mut::<Heard>().0.clear();
+    s.app.world_mut().resource_mut::<ReceivedFaults>().0.clear();
     s.app.world_mut().resource_mut::<Network>().0 = false;
     until(&mut s, "nothing new comes: the force fades", |s| {
-        let heard = &s.app.world().resource::<Heard>().0;
-        heard.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
+        let received = &s.app.world().resource::<ReceivedFaults>().0;
+        received.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
     });
     stays(&mut s, "and stays away", |s| force(s) == DVec3::ZERO);
     s.app.world_mut().resource_mut::<Network>().0 = true;
@@ -496,15 +502,15 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     let bomb = Bomb(device, std::sync::Arc::clone(&fuse));
     s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(bomb, machine::patient()).unwrap();
     s.tool = s.app.world_mut().spawn((HapticTool::new(s.device), ToolGrip::default(), at)).id();
-    s.app.init_resource::<Heard>().init_resource::<Notices>();
+    s.app.init_resource::<ReceivedFaults>().init_resource::<Notices>();
     s.app.add_systems(
         Update,
         |mut faults: MessageReader<HapticFault>,
          mut notices: MessageReader<HapticNotice>,
-         mut heard: ResMut<Heard>,
-         mut told: ResMut<Notices>| {
-            heard.0.extend(faults.read().filter_map(|f| f.fault));
-            told.0.extend(notices.read().map(|n| n.event));
+         mut received: ResMut<ReceivedFaults>,
+         mut ends: ResMut<Notices>| {
+            received.0.extend(faults.read().filter_map(|f| f.fault));
+            ends.0.extend(notices.read().map(|n| n.event));
         },
     );
     let tool = s.tool;
@@ -515,7 +521,9 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     until(&mut s, "a force", |s| force(s).length() > 1.0);
     fuse.store(true, std::sync::atomic::Ordering::Release);
     until(&mut s, "the body is let go of", |s| grabs(&mut s.app).is_empty());
-    let count = |world: &World| world.resource::<Heard>().0.iter().filter(|f| **f == Fault::Panicked).count();
+    let count = |world: &World| {
+        world.resource::<ReceivedFaults>().0.iter().filter(|f| **f == Fault::Panicked).count()
+    };
     let state = |s: &Scene| s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.state;
     until(&mut s, "the end is told", |s| {
         let world = s.app.world();

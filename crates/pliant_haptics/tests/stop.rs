@@ -50,7 +50,7 @@ impl Loop {
 }
 
 /// Tells the loop to unlatch, if there is room.
-fn tell(commands: &Commands) -> bool {
+fn push_command(commands: &Commands) -> bool {
     let mut commands = commands.lock().unwrap();
     let has_room = commands.is_empty();
     if has_room {
@@ -74,7 +74,7 @@ fn a_press_beside_a_reset_ends_latched_or_free_as_the_switch_says() {
         let (stop, commands, mut of_loop) = pressed(&[]);
         let (by, app) = (stop.clone(), stop.clone());
         let presser = thread::spawn(move || by.press());
-        let app = thread::spawn(move || app.reset(true, || tell(&commands)));
+        let app = thread::spawn(move || app.reset(true, || push_command(&commands)));
         of_loop.period();
         presser.join().unwrap();
         assert!(app.join().unwrap(), "there is room");
@@ -90,7 +90,7 @@ fn a_reset_that_finds_no_room_leaves_the_stop_pressed() {
         let app = stop.clone();
         let app = thread::spawn(move || {
             let has_room = commands.lock().unwrap().is_empty();
-            app.reset(has_room, || tell(&commands))
+            app.reset(has_room, || push_command(&commands))
         });
         of_loop.period();
         let is_reset = app.join().unwrap();

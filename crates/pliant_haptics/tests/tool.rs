@@ -25,7 +25,7 @@ fn spring(offset: [f64; 3], proxy: [f64; 3], k: f64) -> ToolContact {
 }
 
 /// Holds the device still at `sample` until the ramp and the slew are over.
-fn settle(core: &mut LoopCore, sample: &Sample, contacts: &[ToolContact]) -> ([f64; 3], [f64; 3]) {
+fn step_to_rest(core: &mut LoopCore, sample: &Sample, contacts: &[ToolContact]) -> ([f64; 3], [f64; 3]) {
     let mut model = LocalModel { period: 0.01, count: contacts.len(), ..LocalModel::default() };
     model.contacts[..contacts.len()].copy_from_slice(contacts);
     let mut now = core.last().now;
@@ -50,17 +50,21 @@ fn two_grabs_on_a_tool_turn_it() {
     // other 1 cm down. F = 100 N/m x 1 cm = 1 N, and the torque is 2 x 0.05 m x 1 N about z.
     let right = spring([0.05, 0.0, 0.0], [0.05, 0.01, 0.0], 100.0);
     let left = spring([-0.05, 0.0, 0.0], [-0.05, -0.01, 0.0], 100.0);
-    let (force, torque) = settle(&mut core, &Sample::default(), &[right, left]);
+    let (force, torque) = step_to_rest(&mut core, &Sample::default(), &[right, left]);
     near(force, [0.0; 3], "no force in sum");
     near(torque, [0.0, 0.0, 0.1], "a couple about z");
     // The device has no motor for that axis.
     let blind = DeviceInfo { torque_axes: [true, true, false], ..six() };
     let mut core = LoopCore::new(blind, LoopConfig::default()).unwrap();
-    near(settle(&mut core, &Sample::default(), &[right, left]).1, [0.0; 3], "masked");
+    near(step_to_rest(&mut core, &Sample::default(), &[right, left]).1, [0.0; 3], "masked");
     // A torque above the motors' peak is clamped.
     let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
     let strong = |c: ToolContact| ToolContact { stiffness: c.stiffness.map(|r| r.map(|x| 50.0 * x)), ..c };
-    near(settle(&mut core, &Sample::default(), &[strong(right), strong(left)]).1, [0.0, 0.0, 0.5], "clamped");
+    near(
+        step_to_rest(&mut core, &Sample::default(), &[strong(right), strong(left)]).1,
+        [0.0, 0.0, 0.5],
+        "clamped",
+    );
 }
 
 #[test]
@@ -69,7 +73,7 @@ fn a_torque_is_cut_as_its_force_is_and_real_motors_get_none() {
     // 0.165 N m and not the motors' 0.5 N m.
     let pull = spring([0.05, 0.0, 0.0], [0.05, 0.01, 0.0], 1000.0);
     let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
-    let (force, torque) = settle(&mut core, &Sample::default(), &[pull]);
+    let (force, torque) = step_to_rest(&mut core, &Sample::default(), &[pull]);
     near(force, [0.0, 3.3, 0.0], "the peak");
     near(torque, [0.0, 0.0, 0.05 * 3.3], "and its torque");
     // An emergency stop cuts both in one tick.
@@ -86,7 +90,7 @@ fn a_torque_is_cut_as_its_force_is_and_real_motors_get_none() {
     // the torque motors of real devices.
     let real = DeviceInfo { simulated: false, ..six() };
     let mut core = LoopCore::new(real, LoopConfig::default()).unwrap();
-    let (force, torque) = settle(&mut core, &Sample::default(), &[pull]);
+    let (force, torque) = step_to_rest(&mut core, &Sample::default(), &[pull]);
     near(force, [0.0, 3.3, 0.0], "the force is felt");
     assert_eq!(torque, [0.0; 3]);
 }
@@ -106,7 +110,7 @@ fn scale_masks_and_weight() {
     };
     let mut core = LoopCore::new(six(), LoopConfig { tool, ..LoopConfig::default() }).unwrap();
     let sample = Sample::at([0.005, 0.0, 0.01]);
-    let (force, _) = settle(&mut core, &sample, &[spring([0.0; 3], [0.0; 3], 100.0)]);
+    let (force, _) = step_to_rest(&mut core, &sample, &[spring([0.0; 3], [0.0; 3], 100.0)]);
     // 1 cm along y in the world gives 1 N, times 2 x 0.5 at the hand. The mass of 50 g pulls down.
     near(force, [-1.0, -0.05 * 9.806_65, 0.0], "scaled, masked and weighed");
     let tool = core.last().tool;

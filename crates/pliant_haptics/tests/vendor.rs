@@ -290,8 +290,8 @@ fn force_dimension_faults_and_versions() {
 #[test]
 fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
     let path = fake("dhd", "plain", &[]);
-    let told = |path: &Path| ForceDimensionConfig { auto_init: true, ..dhd(path) };
-    let plain = ForceDimension::open(told(&path));
+    let auto_init_config = |path: &Path| ForceDimensionConfig { auto_init: true, ..dhd(path) };
+    let plain = ForceDimension::open(auto_init_config(&path));
     assert!(matches!(plain, Err(VendorError::Symbol { symbol: "drdOpenID", .. })), "{plain:?}");
     let path = fake("dhd", "robotic", &["-DWITH_DRD"]);
     let library = open_fake(&path);
@@ -304,7 +304,7 @@ fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
     assert_eq!(drives(), 0);
     // With the setting, the device moves once. The library's own control loop has then ended, and
     // the forces are enabled.
-    let mut device = ForceDimension::open(told(&path)).unwrap();
+    let mut device = ForceDimension::open(auto_init_config(&path)).unwrap();
     assert_eq!((drives(), device.calibration()), (1, Calibration::Ready));
     assert_eq!(call!(library, "fake_driving", fn() -> c_int,), 0);
     assert_eq!(call!(library, "fake_enabled", fn() -> c_int,), 1);
@@ -321,11 +321,11 @@ fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
     drop(device);
     // A device that knows its position does not move. A device that cannot move is refused and
     // closed.
-    drop(ForceDimension::open(told(&path)).unwrap());
+    drop(ForceDimension::open(auto_init_config(&path)).unwrap());
     assert_eq!(drives(), 2);
     call!(library, "fake_reset", fn(c_int), 0);
     call!(library, "fake_stuck", fn(c_int), 1);
-    let stuck = ForceDimension::open(told(&path));
+    let stuck = ForceDimension::open(auto_init_config(&path));
     assert!(matches!(stuck, Err(VendorError::Device { what: "drdAutoInit", code: 1008, .. })), "{stuck:?}");
     assert_eq!(call!(library, "fake_driving", fn() -> c_int,), 0);
     assert_eq!(call!(library, "fake_open", fn() -> c_int,), 0);

@@ -49,13 +49,13 @@ enum Flood {
 
 const ALL: [Flood; 3] = [Flood::Targets, Flood::Messages, Flood::Grabs];
 
-struct Stranger {
+struct FloodingPeer {
     thread: Option<JoinHandle<()>>,
     stop: Arc<AtomicBool>,
     sent: Arc<AtomicU64>,
 }
 
-impl Stranger {
+impl FloodingPeer {
     /// Joins and floods the host until it is dropped.
     fn at(invite: &Invite, model: &ModalModel, flood: Flood) -> Self {
         let limits = Limits { message: Limits::guest().message, ..limits() };
@@ -140,11 +140,11 @@ impl Stranger {
     }
 }
 
-impl Drop for Stranger {
+impl Drop for FloodingPeer {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         let ended = self.thread.take().is_none_or(|thread| thread.join().is_ok());
-        assert!(ended || std::thread::panicking(), "the stranger's thread panicked");
+        assert!(ended || std::thread::panicking(), "the flooding peer's thread panicked");
     }
 }
 
@@ -186,9 +186,9 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration, whom: Whom) -> Flooded {
         .then(|| host_of(HostConfig { transport: another, ..HostConfig::default() }, model.clone()));
     let flooded_host = another.as_ref().map_or(&invite, |(_, invite, _)| invite);
     let floods = if whom == Whom::Nobody { &[][..] } else { &ALL };
-    let strangers: Vec<Stranger> =
-        floods.iter().map(|&flood| Stranger::at(flooded_host, model, flood)).collect();
-    let sent = || -> Vec<u64> { strangers.iter().map(|s| s.sent.load(Ordering::Relaxed)).collect() };
+    let flooding: Vec<FloodingPeer> =
+        floods.iter().map(|&flood| FloodingPeer::at(flooded_host, model, flood)).collect();
+    let sent = || -> Vec<u64> { flooding.iter().map(|s| s.sent.load(Ordering::Relaxed)).collect() };
     let mut flooded = Flooded { read: Vec::new(), frames: Vec::new(), joined: Duration::ZERO };
     let (mut began, mut second, mut before) = (None::<Instant>, None::<(Instant, App)>, read(&host));
     let mut hands = host.world_mut().query_filtered::<Entity, With<HandOf>>();
@@ -238,8 +238,8 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration, whom: Whom) -> Flooded {
     let world = host.world().resource::<NetHost>();
     let dropped = world.endpoint().unwrap().stats(PeerId(1)).unwrap().dropped;
     assert_eq!((dropped.receive_queue_full, dropped.send_queue_full), (0, 0));
-    let strangers = if whom == Whom::ThisHost { floods.len() } else { 0 };
-    assert_eq!(world.session().users().count(), 2 + strangers, "the guests and the strangers are in");
+    let flooding = if whom == Whom::ThisHost { floods.len() } else { 0 };
+    assert_eq!(world.session().users().count(), 2 + flooding, "the guests and the flooding peers are in");
     flooded
 }
 

@@ -28,10 +28,10 @@ fn no_text_panics_the_reader_of_invites() {
             // What was read is written and read again alike.
             Ok(invite) => assert_eq!(invite.to_string().parse(), Ok(invite)),
             Err(error) => {
-                let said = error.to_string();
+                let message = error.to_string();
                 // The error shows the form of an invite, which is shorter.
-                assert!(text.len() < 40 || !said.contains(&*text), "repeats an invite: {said}");
-                assert!(!said.contains(&"0c".repeat(4)), "repeats a token: {said}");
+                assert!(text.len() < 40 || !message.contains(&*text), "repeats an invite: {message}");
+                assert!(!message.contains(&"0c".repeat(4)), "repeats a token: {message}");
             }
         }
     });
@@ -73,7 +73,7 @@ fn no_file_panics_the_reader_of_recordings() {
 
 const SERVER: u64 = 0;
 const GUEST: u64 = 7;
-const STRANGER: u64 = 8;
+const UNKNOWN: u64 = 8;
 /// Largest datagram of the netcode, and longest message of a session here.
 const ROOM: usize = 1200;
 const LONGEST: usize = 4096;
@@ -89,7 +89,7 @@ struct Ports {
 }
 
 impl Ports {
-    fn stranger() -> RemotePath {
+    fn unknown_path() -> RemotePath {
         RemotePath { key: Fingerprint::of_name(b"stranger"), role: Role::Hold, max_datagram: ROOM }
     }
 
@@ -98,7 +98,7 @@ impl Ports {
         let path = |key| RemotePath { key, role: Role::Hold, max_datagram: ROOM };
         let (server, guest) = (CarrierPort::new(keys[0]), CarrierPort::new(keys[1]));
         server.connected(GUEST, path(keys[1]));
-        server.connected(STRANGER, Self::stranger());
+        server.connected(UNKNOWN, Self::unknown_path());
         guest.connected(SERVER, path(keys[0]));
         Self { server, guest, sent: 0, read: 0 }
     }
@@ -158,7 +158,7 @@ fn what_a_port_receives_panics_nothing_and_costs_no_other_end_its_session() {
         let joined = ports.guest.join(SERVER, Limits::guest());
         ports.carry();
         let Some(Event::Connected { peer: guest, .. }) = host.poll() else { panic!("the guest gets in") };
-        let told = |event: Event| match event {
+        let event_of = |event: Event| match event {
             Event::Closed { reason, .. } => panic!("the guest is told that it is out: {reason}"),
             event => event,
         };
@@ -172,7 +172,7 @@ fn what_a_port_receives_panics_nothing_and_costs_no_other_end_its_session() {
                     script = rest;
                     let channel = if channel == 0 { Channel::Message } else { Channel::Datagram };
                     let bytes = Bytes::copy_from_slice(bytes.get(1..).unwrap_or_default());
-                    ports.server.receive(STRANGER, channel, bytes);
+                    ports.server.receive(UNKNOWN, channel, bytes);
                 }
                 2 => ports.carry(),
                 3 => {
@@ -188,8 +188,8 @@ fn what_a_port_receives_panics_nothing_and_costs_no_other_end_its_session() {
                         let _ = host.send_datagram(peer, Bytes::from(vec![7; 1000]));
                     }
                 }
-                5 => ports.server.disconnected(STRANGER, DisconnectReason::Lost),
-                6 => ports.server.connected(STRANGER, Ports::stranger()),
+                5 => ports.server.disconnected(UNKNOWN, DisconnectReason::Lost),
+                6 => ports.server.connected(UNKNOWN, Ports::unknown_path()),
                 7 => {
                     for peer in host.peers().into_iter().filter(|peer| *peer != guest) {
                         host.close(peer, DisconnectReason::Kicked);
@@ -197,11 +197,11 @@ fn what_a_port_receives_panics_nothing_and_costs_no_other_end_its_session() {
                 }
                 _ => {
                     let part = [&[4, 5, 0][..], &[1; 1000]].concat();
-                    ports.server.receive(STRANGER, Channel::Message, part.into());
+                    ports.server.receive(UNKNOWN, Channel::Message, part.into());
                 }
             }
             ports.read(&host, guest);
-            std::iter::from_fn(|| joined.poll()).for_each(|event| drop(told(event)));
+            std::iter::from_fn(|| joined.poll()).for_each(|event| drop(event_of(event)));
         }
         // The cap on the rate holds back a part for some milliseconds.
         for _ in 0..1000 {
@@ -212,7 +212,7 @@ fn what_a_port_receives_panics_nothing_and_costs_no_other_end_its_session() {
             }
             std::thread::sleep(std::time::Duration::from_millis(1));
         }
-        std::iter::from_fn(|| joined.poll()).for_each(|event| drop(told(event)));
+        std::iter::from_fn(|| joined.poll()).for_each(|event| drop(event_of(event)));
         assert_eq!(ports.read, ports.sent, "all that the guest has sent has come");
     });
 }

@@ -93,10 +93,10 @@ impl UnauthenticatedPeer {
     }
 
     fn welcomed(&self) -> bool {
-        self.said(|message| matches!(message, PeerMessage::Welcome { .. }))
+        self.sent(|message| matches!(message, PeerMessage::Welcome { .. }))
     }
 
-    fn said(&self, what: impl Fn(&PeerMessage) -> bool) -> bool {
+    fn sent(&self, what: impl Fn(&PeerMessage) -> bool) -> bool {
         self.messages.iter().any(|bytes| PeerMessage::decode(bytes).is_ok_and(|message| what(&message)))
     }
 }
@@ -109,12 +109,12 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
     let hello = hello(&a, 0, &invite);
     // First the correct order, to check that these messages are accepted.
     let mut right = UnauthenticatedPeer::at(&invite.clone().with_token(hold));
-    let mut said = false;
+    let mut sent = false;
     run_until(&mut [&mut a], "who may hold is let in", |_| {
         right.listen();
-        if right.connected && !said {
+        if right.connected && !sent {
             right.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
-            said = true;
+            sent = true;
         }
         right.welcomed()
     });
@@ -151,9 +151,9 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     let mut silent: Vec<UnauthenticatedPeer> = (0..4).map(|_| UnauthenticatedPeer::at(&invite)).collect();
     run_until(&mut [&mut a], "all are hung up on", |_| {
         silent.iter_mut().for_each(UnauthenticatedPeer::listen);
-        silent.iter().all(|stranger| stranger.closed.is_some())
+        silent.iter().all(|caller| caller.closed.is_some())
     });
-    assert!(silent.iter().all(|stranger| stranger.closed == Some(DisconnectReason::Silent)));
+    assert!(silent.iter().all(|caller| caller.closed == Some(DisconnectReason::Silent)));
     // A peer that introduces itself stays connected, for longer than a later one that does not.
     let mut b = peer("b", Some(invite.clone()), Access::Anyone, limits());
     run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| users(apps[0]) == 2 && users(apps[1]) == 2);
@@ -172,12 +172,12 @@ fn who_says_hello_and_then_nothing_keeps_no_place() {
     let limits = Limits { idle_timeout: Duration::from_secs(4), ..limits() };
     let (mut a, invite) = first(Access::Anyone, limits);
     let hello = hello(&a, 0, &invite);
-    let (mut caller, mut said) = (UnauthenticatedPeer::at(&invite), false);
+    let (mut caller, mut sent) = (UnauthenticatedPeer::at(&invite), false);
     run_until(&mut [&mut a], "it gets a number", |apps| {
         caller.listen();
-        if caller.connected && !said {
+        if caller.connected && !sent {
             caller.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
-            said = true;
+            sent = true;
         }
         caller.welcomed() && users(apps[0]) == 2
     });
@@ -241,7 +241,7 @@ fn who_comes_before_our_own_welcome_waits_for_it() {
     run_until(&mut [&mut app], "it talks to the other", |_| {
         other.listen();
         assert_eq!(other.closed, None);
-        other.said(|message| matches!(message, PeerMessage::Hello { user: 2, .. }))
+        other.sent(|message| matches!(message, PeerMessage::Hello { user: 2, .. }))
     });
 }
 
@@ -313,13 +313,13 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
 
 /// Brings a caller with this first message to `app`, until it is answered or closed.
 fn call(app: &mut App, caller: &mut UnauthenticatedPeer, hello: &Bytes) {
-    let mut said = false;
+    let mut sent = false;
     run_until(&mut [app], "the caller is answered or closed", |_| {
         caller.listen();
-        if caller.connected && !std::mem::replace(&mut said, true) {
+        if caller.connected && !std::mem::replace(&mut sent, true) {
             caller.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
         }
-        caller.closed.is_some() || caller.said(|message| matches!(message, PeerMessage::Hello { .. }))
+        caller.closed.is_some() || caller.sent(|message| matches!(message, PeerMessage::Hello { .. }))
     });
 }
 
@@ -347,7 +347,7 @@ fn a_number_stays_with_its_key_also_while_its_peer_is_away() {
     call(&mut a, &mut owner, &asks);
     run_until(&mut [&mut a], "it is number 2", |apps| {
         owner.listen();
-        users(apps[0]) == 2 && owner.said(|message| matches!(message, PeerMessage::Welcome { user: 2, .. }))
+        users(apps[0]) == 2 && owner.sent(|message| matches!(message, PeerMessage::Welcome { user: 2, .. }))
     });
     drop(owner);
     run_until(&mut [&mut a], "it is away", |apps| users(apps[0]) == 1);
@@ -358,7 +358,7 @@ fn a_number_stays_with_its_key_also_while_its_peer_is_away() {
     run_until(&mut [&mut a], "it is sent away", |_| {
         thief.listen();
         assert!(
-            !thief.said(|message| matches!(message, PeerMessage::Hello { .. })),
+            !thief.sent(|message| matches!(message, PeerMessage::Hello { .. })),
             "another key was answered as number 2"
         );
         thief.closed.is_some()
@@ -383,7 +383,7 @@ fn sixty_four_silent_connections_bar_no_peer() {
     let mut silent: Vec<UnauthenticatedPeer> = (0..64).map(|_| UnauthenticatedPeer::at(&invite)).collect();
     run_until(&mut [&mut a], "all are connected", |_| {
         silent.iter_mut().for_each(UnauthenticatedPeer::listen);
-        silent.iter().all(|stranger| stranger.connected)
+        silent.iter().all(|caller| caller.connected)
     });
     let mut b = peer("b", Some(invite), Access::Anyone, limits);
     run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| {
@@ -485,12 +485,12 @@ fn of_one_who_comes_back_the_others_are_told_again() {
         call(&mut a, &mut goes, &asks);
         run_until(&mut [&mut a], "the second is told of the third", |_| {
             stays.listen();
-            let told = |bytes: &&Bytes| match PeerMessage::decode(bytes) {
+            let count = |bytes: &&Bytes| match PeerMessage::decode(bytes) {
                 Ok(PeerMessage::Others { others }) => others.iter().any(|(user, _)| *user == 3),
                 _ => false,
             };
-            let told = stays.messages.iter().filter(told).count();
-            must!(told == times, "told {told} times, and it has come {times} times");
+            let count = stays.messages.iter().filter(count).count();
+            must!(count == times, "told {count} times, and it has come {times} times");
             Ok(())
         });
         drop(goes);

@@ -406,10 +406,10 @@ fn a_peer_with_another_body_is_not_let_in() {
     });
     let invite = a.world().resource::<NetPeer>().invite();
     let net = NetPlugin::peer(PeerConfig { join: Some(invite), ..PeerConfig::default() }).unwrap();
-    let mut stranger = app(net);
-    let handle = stranger.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
-    stranger.world_mut().spawn((ModalBody::new(handle), SharedBody::named("rod")));
-    run_until(&mut [&mut a, &mut stranger], "it is told why", |apps| {
+    let mut other = app(net);
+    let handle = other.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
+    other.world_mut().spawn((ModalBody::new(handle), SharedBody::named("rod")));
+    run_until(&mut [&mut a, &mut other], "it is told why", |apps| {
         matches!(
             apps[1].world().resource::<NetPeer>().state(),
             PeerState::Closed { reason: DisconnectReason::SceneMismatch }

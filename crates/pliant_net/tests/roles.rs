@@ -71,9 +71,9 @@ fn a_watcher_sees_and_does_not_hold_and_all_know_who_is_who() {
         },
     );
     run_until(&mut [&mut host, &mut holder, &mut watcher], "all know the same", |apps| {
-        let said: Vec<BTreeMap<u16, Role>> = apps.iter_mut().map(|app| roles(app)).collect();
-        must!(said[0].values().filter(|role| **role == Role::Watch).count() == 1, "{said:?}");
-        must!(said[1] == said[0] && said[2] == said[0], "{said:?}");
+        let of_apps: Vec<BTreeMap<u16, Role>> = apps.iter_mut().map(|app| roles(app)).collect();
+        must!(of_apps[0].values().filter(|role| **role == Role::Watch).count() == 1, "{of_apps:?}");
+        must!(of_apps[1] == of_apps[0] && of_apps[2] == of_apps[0], "{of_apps:?}");
         Ok(())
     });
 }
@@ -109,11 +109,11 @@ fn a_host_takes_a_guests_hand_off_and_the_guest_knows() {
     // Targets that the guest still sends have no effect, and another hand of the guest may hold the
     // body.
     guest.world_mut().get_mut::<Grab>(grab).unwrap().target.y += 0.1;
-    let heard = |host: &App| host.world().resource::<NetStats>().datagrams_in;
-    let before = heard(&host);
+    let datagrams = |host: &App| host.world().resource::<NetStats>().datagrams_in;
+    let before = datagrams(&host);
     run_until(&mut [&mut host, &mut guest], "more of the guest is heard", |apps| {
         assert!(only::<HandOf>(apps[0]).is_none());
-        heard(apps[0]) > before + 5
+        datagrams(apps[0]) > before + 5
     });
     guest.world_mut().despawn(grab);
     guest.world_mut().spawn(hold);

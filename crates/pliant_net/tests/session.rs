@@ -202,8 +202,8 @@ fn a_guests_impulse_acts_once_on_the_hosts_body() {
     guest.world_mut().write_message(Impulse { body: there, vertex: 7, impulse: sent });
     guest.world_mut().write_message(Impulse { body: there, vertex: 7, impulse: DVec3::NAN });
     let refused = Arc::new(Mutex::new(Vec::new()));
-    let told = refused.clone();
-    guest.add_observer(move |of: On<BodyRefused>| told.lock().unwrap().push(of.error.to_string()));
+    let received = refused.clone();
+    guest.add_observer(move |of: On<BodyRefused>| received.lock().unwrap().push(of.error.to_string()));
     run_frames(&mut [&mut host, &mut guest], 60);
     assert!(momentum(&host).distance(3.0 * sent) < 1e-6 * sent.length(), "the host alone may");
     let refused = refused.lock().unwrap();
@@ -218,17 +218,17 @@ fn a_guest_is_told_what_stands_still_around_a_free_body() {
     let (mut host, invite, body) = host_of(HostConfig::default(), jack);
     let mut guest = guest(&invite, JoinConfig::default());
     arrival(&mut host, &mut guest);
-    let told = |guest: &App| {
+    let received = |guest: &App| {
         let session = guest.world().resource::<NetGuest>().session().unwrap();
         session.bodies().next().map(|view| view.info().around.clone()).unwrap()
     };
-    assert!(told(&guest).obstacles.is_empty());
+    assert!(received(&guest).obstacles.is_empty());
     let floor = Plane { point: [0.0, -1.0, 0.0], ..Plane::GROUND };
     let mut state = host.world_mut().get_mut::<BodyState>(body).unwrap();
     state.body_mut().set_obstacles(vec![Arc::new(floor)]).unwrap();
     state.body_mut().set_friction(0.3).unwrap();
     run_until(&mut [&mut host, &mut guest], "the guest knows the floor", |apps| {
-        let around = told(apps[1]);
+        let around = received(apps[1]);
         must!(around.obstacles == [floor.fixed().unwrap()] && around.friction == 0.3, "{around:?}");
         Ok(())
     });

@@ -59,11 +59,11 @@ fn step(host: &mut HostSession, now: Duration, tick: u64) {
 fn changes_of_interest_make_few_encoders() {
     let mut host = host();
     // Another number of modes for each tick.
-    let wishes = ten_seconds(&mut host, |host, now, k| {
+    let subscriptions = ten_seconds(&mut host, |host, now, k| {
         let modes = Some([1, 2, 3, 4, 6, 8, 12][k as usize % 7]);
         host.on_message(now, PeerId(1), &GuestMessage::Interest { body: BODY.0, modes }.encode());
     });
-    assert_eq!(wishes.len(), 10 * FRAMES as usize);
+    assert_eq!(subscriptions.len(), 10 * FRAMES as usize);
     assert_eq!(host.users().count(), 1, "it is still there");
     let made = host.encoders_made();
     assert!(made <= 8, "{made} encoders for seven numbers of modes");
@@ -116,19 +116,19 @@ fn sixty_four_targets_in_each_datagram_move_a_hand_no_more_often_than_a_hand_mov
 fn a_guest_strikes_no_more_often_than_its_budget_and_stays_in() {
     let (mut host, now) = (host(), Duration::ZERO);
     while host.poll_event().is_some() {}
-    let struck = |host: &mut HostSession| {
+    let applied = |host: &mut HostSession| {
         std::iter::from_fn(|| host.poll_event()).filter(|e| matches!(e, HostEvent::Impulse { .. })).count()
     };
-    let strike = |vertex, impulse| GuestMessage::Impulse { body: BODY.0, vertex, impulse }.encode();
+    let impulse_message = |vertex, impulse| GuestMessage::Impulse { body: BODY.0, vertex, impulse }.encode();
     // A vertex that is not there and a body that is not there pay, too.
-    host.on_message(now, PeerId(1), &strike(1_000_000, [1.0; 3]));
+    host.on_message(now, PeerId(1), &impulse_message(1_000_000, [1.0; 3]));
     host.on_message(
         now,
         PeerId(1),
         &GuestMessage::Impulse { body: 99, vertex: 0, impulse: [1.0; 3] }.encode(),
     );
     for _ in 0..1000 {
-        host.on_message(now, PeerId(1), &strike(0, [0.0, 1e9, 0.0]));
+        host.on_message(now, PeerId(1), &impulse_message(0, [0.0, 1e9, 0.0]));
     }
     let events: Vec<HostEvent> = std::iter::from_fn(|| host.poll_event()).collect();
     assert_eq!(events.len(), 118, "120 at once");
@@ -137,13 +137,13 @@ fn a_guest_strikes_no_more_often_than_its_budget_and_stays_in() {
     assert!((impulse[1] - 200.0).abs() < 1e-9, "{impulse:?}");
     for second in 1..=10 {
         for _ in 0..500 {
-            host.on_message(Duration::from_secs(second), PeerId(1), &strike(0, [0.1; 3]));
+            host.on_message(Duration::from_secs(second), PeerId(1), &impulse_message(0, [0.1; 3]));
         }
-        assert_eq!(struck(&mut host), 60, "second {second}");
+        assert_eq!(applied(&mut host), 60, "second {second}");
     }
     assert!(host.stats(PeerId(1)).is_some(), "the guest is still there");
     // What is no number is a breach.
-    host.on_message(Duration::from_secs(11), PeerId(1), &strike(0, [f64::NAN; 3]));
+    host.on_message(Duration::from_secs(11), PeerId(1), &impulse_message(0, [f64::NAN; 3]));
     assert!(host.stats(PeerId(1)).is_none());
 }
 
@@ -192,7 +192,7 @@ fn enter(host: &mut HostSession, now: Duration, peer: u64, user: u16, hello: &[u
     assert_eq!(given, Ok(UserId(user)));
 }
 
-fn strike() -> Vec<u8> {
+fn impulse_message() -> Vec<u8> {
     GuestMessage::Impulse { body: BODY.0, vertex: 0, impulse: [0.1; 3] }.encode()
 }
 
@@ -200,7 +200,7 @@ fn strike() -> Vec<u8> {
 /// no more messages than are allowed. The radii differ, so that no table has the patches.
 fn spend_all(host: &mut HostSession, now: Duration, peer: u64) {
     for _ in 0..130 {
-        host.on_message(now, PeerId(peer), &strike());
+        host.on_message(now, PeerId(peer), &impulse_message());
     }
     for grab in 0..2 {
         let radius = 1.01 + 1e-6 * (now.as_millis() as f64 + f64::from(grab) / 2.0);
@@ -290,7 +290,7 @@ fn many_fresh_users_stay_within_the_budget_of_all_and_cost_nobody_who_was_there(
             let grab = sent as u16;
             host.on_message(now, PeerId(1), &GuestMessage::GrabEnd { grab: grab - 1 }.encode());
             host.on_message(now, PeerId(1), &begin(grab, 4 * k, 0.05));
-            host.on_message(now, PeerId(1), &strike());
+            host.on_message(now, PeerId(1), &impulse_message());
         }
         step(&mut host, now, k.into());
         while host.poll_output().is_some() {}
@@ -325,7 +325,7 @@ fn two_hundred_and_fifty_six_users_are_not_hindered_by_the_budget_of_all() {
                 let peer = PeerId(user.into());
                 host.on_message(now, peer, &GuestMessage::GrabEnd { grab: hand }.encode());
                 host.on_message(now, peer, &begin(hand, 400 + k, 0.05));
-                (0..3).for_each(|_| host.on_message(now, peer, &strike()));
+                (0..3).for_each(|_| host.on_message(now, peer, &impulse_message()));
                 sent += 1;
             }
         }

@@ -22,7 +22,7 @@ fn peer(user: u16) -> PeerSession {
 
 /// Brings the messages of one peer to another, and returns how many tell of others. Those for
 /// connections from 10 on are for somebody else.
-fn tell(now: Duration, from: &mut PeerSession, to: &mut PeerSession, name: PeerId) -> usize {
+fn deliver(now: Duration, from: &mut PeerSession, to: &mut PeerSession, name: PeerId) -> usize {
     let mut lists = 0;
     while let Some(output) = from.poll_output() {
         if output.channel == Channel::Message && output.peer.0 < 10 {
@@ -57,8 +57,8 @@ fn a_peer_is_told_of_those_that_it_lacks_and_no_more_often_than_they_come() {
     second.on_message(Duration::ZERO, one, &early);
     assert_eq!(introduced(&mut second), Vec::<Vec<_>>::new());
     for _ in 0..2 {
-        tell(Duration::ZERO, &mut first, &mut second, one);
-        tell(Duration::ZERO, &mut second, &mut first, two);
+        deliver(Duration::ZERO, &mut first, &mut second, one);
+        deliver(Duration::ZERO, &mut second, &mut first, two);
     }
     let mut lists = Vec::new();
     for half in 1..20 {
@@ -67,8 +67,8 @@ fn a_peer_is_told_of_those_that_it_lacks_and_no_more_often_than_they_come() {
         first.introduce(&list).unwrap();
         first.update(now);
         second.update(now);
-        lists.push(tell(now, &mut first, &mut second, one));
-        tell(now, &mut second, &mut first, two);
+        lists.push(deliver(now, &mut first, &mut second, one));
+        deliver(now, &mut second, &mut first, two);
     }
     assert_eq!(lists.iter().sum::<usize>(), 2, "{lists:?}");
     let lists = introduced(&mut second);
@@ -83,8 +83,8 @@ fn who_has_left_and_comes_back_is_told_of_again_under_the_same_list() {
     first.connect(Duration::ZERO, two, None, 1200).unwrap();
     second.accept(Duration::ZERO, one, 1200).unwrap();
     for _ in 0..2 {
-        tell(Duration::ZERO, &mut first, &mut second, one);
-        tell(Duration::ZERO, &mut second, &mut first, two);
+        deliver(Duration::ZERO, &mut first, &mut second, one);
+        deliver(Duration::ZERO, &mut second, &mut first, two);
     }
     let list = [2, 3].map(|user| (UserId(user), String::new()));
     let mut lists = Vec::new();
@@ -111,8 +111,8 @@ fn who_has_left_and_comes_back_is_told_of_again_under_the_same_list() {
         first.introduce(&list).unwrap();
         first.update(now);
         second.update(now);
-        lists.push(tell(now, &mut first, &mut second, one));
-        tell(now, &mut second, &mut first, two);
+        lists.push(deliver(now, &mut first, &mut second, one));
+        deliver(now, &mut second, &mut first, two);
         first.disconnect(three, DisconnectReason::Lost);
         third.disconnect(one, DisconnectReason::Lost);
         third.introduce(&[]).unwrap();
@@ -127,8 +127,8 @@ fn lists_in_a_flood_are_left_out_and_long_addresses_refused() {
     first.connect(Duration::ZERO, two, None, 1200).unwrap();
     second.accept(Duration::ZERO, one, 1200).unwrap();
     for _ in 0..2 {
-        tell(Duration::ZERO, &mut first, &mut second, one);
-        tell(Duration::ZERO, &mut second, &mut first, two);
+        deliver(Duration::ZERO, &mut first, &mut second, one);
+        deliver(Duration::ZERO, &mut second, &mut first, two);
     }
     let list = PeerMessage::Others { others: vec![(7, "seven".into()), (2, "itself".into())] }.encode();
     for k in 0..1000u32 {

@@ -259,7 +259,7 @@ fn who_leaves_with_many_hands_after_a_silence_makes_nobody_step_many_ticks_again
 }
 
 /// What a crowd on one body has cost the first peer in ten seconds.
-struct Crowd {
+struct Load {
     first: PeerSession,
     /// Ticks that were stepped again, by update.
     restepped: Vec<u64>,
@@ -268,7 +268,7 @@ struct Crowd {
 
 /// Ten seconds of a crowd whose members hold one body with four hands each. All inputs come `late`
 /// ticks after their tick.
-fn crowd(members: u16, late: u64) -> Crowd {
+fn load_of(members: u16, late: u64) -> Load {
     let config = PeerSessionConfig { user: UserId(1), ..Default::default() };
     let mut first = PeerSession::new(config).unwrap();
     first.add_body(BODY, bar(40, 0.05), &StepSettings::default()).unwrap();
@@ -318,13 +318,13 @@ fn crowd(members: u16, late: u64) -> Crowd {
         }
         while first.poll_output().is_some() {}
     }
-    Crowd { first, restepped, times }
+    Load { first, restepped, times }
 }
 
 #[test]
 fn of_a_crowds_hands_thirty_two_act_on_a_body_and_each_users_first_ones_first() {
     for (members, hands, most) in [(4, 16, 4), (8, 32, 4), (24, 32, 2), (40, 32, 1)] {
-        let Crowd { first, .. } = crowd(members, 0);
+        let Load { first, .. } = load_of(members, 0);
         let grabs = first.body(BODY).unwrap().grabs();
         let of = |user: u16| grabs.iter().filter(|grab| grab.key.user == UserId(user)).count();
         let each: Vec<usize> = (2..members + 2).map(of).collect();
@@ -339,7 +339,7 @@ fn of_a_crowds_hands_thirty_two_act_on_a_body_and_each_users_first_ones_first() 
 fn late_inputs_are_paid_for_by_the_hands_of_all() {
     // Too late for a share, of 64 at once.
     let late = 40;
-    let Crowd { restepped, .. } = crowd(24, late);
+    let Load { restepped, .. } = load_of(24, late);
     let steps: u64 = restepped.iter().sum();
     // Of the budget of all, which begins full, a tick costs 37. The last ticks may be owed. The
     // first inputs that come late are known.
@@ -367,7 +367,7 @@ fn time_of_an_update_while_inputs_come_as_late_as_can_be() {
 #[ignore = "measures times"]
 fn time_of_an_update_while_a_crowds_inputs_come_as_late_as_can_be() {
     for (members, late) in [(2, 8), (2, 40), (8, 8), (8, 40), (24, 8), (24, 40)] {
-        let Crowd { mut times, restepped, .. } = crowd(members, late);
+        let Load { mut times, restepped, .. } = load_of(members, late);
         times.sort();
         let at = |share: f64| times[(share * (times.len() - 1) as f64) as usize];
         let again = restepped.iter().sum::<u64>() as f64 / restepped.len() as f64;

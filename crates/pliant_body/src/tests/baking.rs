@@ -10,7 +10,7 @@ use bevy::{
 use pliant_bake::{BakeCache, BakeConfig};
 use pliant_mesh::shapes;
 
-use super::{Told, app, model, refusals, state, tick};
+use super::{Received, app, model, refusals, state, tick};
 use crate::{
     ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeExtrasError, BakeFailed, BakePlugin, BakeProgress,
     BakeRequest, BakeSkin, BodyState, ModalAsset, ModalBody,
@@ -153,14 +153,19 @@ fn what_cannot_be_baked_says_why_and_the_next_one_is_made() {
     let nan = app.world_mut().spawn(nan).id();
     let bare = app.world_mut().spawn(BakeRequest { skin: BakeSkin::Shape, ..bar(5) }).id();
     let good = app.world_mut().spawn(bar(5)).id();
-    app.add_observer(|failed: On<BakeFailed>, mut told: ResMut<Told>| {
-        told.0.push((failed.entity, failed.error.to_string()));
+    app.add_observer(|failed: On<BakeFailed>, mut received: ResMut<Received>| {
+        received.0.push((failed.entity, failed.error.to_string()));
     });
     let seen = wait(&mut app, good);
-    let told = refusals(&mut app);
+    let received = refusals(&mut app);
     assert!(matches!(seen.last(), Some(BakeProgress::Done { .. })), "{seen:?}");
-    assert_eq!(told.iter().map(|(entity, _)| *entity).collect::<Vec<_>>(), [missing, nan, bare], "{told:?}");
-    for ((entity, text), expected) in told.iter().zip(["jelly.obj", "Young's modulus", "expected a surface"])
+    assert_eq!(
+        received.iter().map(|(entity, _)| *entity).collect::<Vec<_>>(),
+        [missing, nan, bare],
+        "{received:?}"
+    );
+    for ((entity, text), expected) in
+        received.iter().zip(["jelly.obj", "Young's modulus", "expected a surface"])
     {
         assert!(text.contains(expected), "{text}");
         assert_eq!(progress(&app, *entity), BakeProgress::Failed { reason: text.clone() });

@@ -96,8 +96,8 @@ fn a_gravity_that_is_no_number_is_refused_once() {
         app.insert_resource(BodyGravity(scene));
         app.world_mut().get_mut::<BodyGravityScale>(body).unwrap().0 = scale;
         steps(&mut app, 3);
-        let told = refusals(&mut app);
-        assert!(told.len() == 1 && told[0].1.contains("gravity"), "{told:?}");
+        let received = refusals(&mut app);
+        assert!(received.len() == 1 && received[0].1.contains("gravity"), "{received:?}");
         assert_eq!(gravity(&app, body), [0.0, -1.0, 0.0]);
     }
     // The size changes the gravity that the body has accepted.

@@ -132,13 +132,19 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
     for (entity, vertex, impulse, word) in wrong {
         app.world_mut().write_message(Impulse { body: entity, vertex, impulse });
         steps(&mut app, 2);
-        let told = refusals(&mut app);
-        assert!(told.len() == 1 && told[0].0 == entity && told[0].1.contains(word), "{word}: {told:?}");
+        let received = refusals(&mut app);
+        assert!(
+            received.len() == 1 && received[0].0 == entity && received[0].1.contains(word),
+            "{word}: {received:?}"
+        );
         if impulse.x < 1e300 {
             app.world_mut().write_message(Push { body: entity, vertex, force: impulse });
             steps(&mut app, 2);
-            let told = refusals(&mut app);
-            assert!(told.len() == 1 && told[0].0 == entity && told[0].1.contains(word), "{word}: {told:?}");
+            let received = refusals(&mut app);
+            assert!(
+                received.len() == 1 && received[0].0 == entity && received[0].1.contains(word),
+                "{word}: {received:?}"
+            );
         }
         assert_eq!(*state(&app, body).body().state(), before);
     }
@@ -148,8 +154,11 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
     assert_eq!(refusals(&mut app).len(), 0);
     app.world_mut().write_message(Push { body: remote, vertex: VERTEX, force: DVec3::Y });
     steps(&mut app, 2);
-    let told = refusals(&mut app);
-    assert!(told.len() == 1 && told[0].0 == remote && told[0].1.contains("remotely"), "{told:?}");
+    let received = refusals(&mut app);
+    assert!(
+        received.len() == 1 && received[0].0 == remote && received[0].1.contains("remotely"),
+        "{received:?}"
+    );
     // The force overflows: the step is refused once, and the next step is valid again.
     app.world_mut().write_message(Push { body, vertex: VERTEX, force: DVec3::splat(f64::MAX) });
     steps(&mut app, 3);

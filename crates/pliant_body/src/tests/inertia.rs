@@ -147,7 +147,7 @@ fn a_turning_parent_takes_gravity_with_the_world() {
 #[test]
 fn a_teleport_gives_nothing() {
     // Far ones are known, and of short ones the app is told.
-    for (way, told, moves) in [(10.0, false, false), (0.5, true, false), (0.5, false, true)] {
+    for (way, announced, moves) in [(10.0, false, false), (0.5, true, false), (0.5, false, true)] {
         for by in ALL {
             let mut app = moving_app(by, 60.0);
             let parent = app.world_mut().spawn((Transform::default(), Visibility::default())).id();
@@ -156,13 +156,13 @@ fn a_teleport_gives_nothing() {
             for jump in 1..=5 {
                 let jumped = Transform::from_xyz(way * jump as f32, 0.0, 0.0);
                 *app.world_mut().get_mut::<Transform>(parent).unwrap() = jumped;
-                if told {
+                if announced {
                     app.world_mut().write_message(Teleport(parent));
                 }
                 run(&mut app, 60.0, 0.2);
             }
             let energy = state(&app, body).body().energy();
-            assert_eq!(energy > 0.0, moves, "{way} m, told {told}, {by:?}: {energy} J");
+            assert_eq!(energy > 0.0, moves, "{way} m, told {announced}, {by:?}: {energy} J");
         }
     }
 }

@@ -41,16 +41,16 @@ pub fn app_in(schedule: impl ScheduleLabel) -> App {
         .insert_resource(Time::<Fixed>::from_seconds(STEP))
         .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
         .add_plugins((PliantBodyPlugin::new(schedule.intern()), RidingPlugin::new(schedule)))
-        .init_resource::<Told>()
-        .add_observer(|refused: On<BodyRefused>, mut told: ResMut<Told>| {
-            told.0.push((refused.entity, refused.error.to_string()));
+        .init_resource::<Received>()
+        .add_observer(|refused: On<BodyRefused>, mut received: ResMut<Received>| {
+            received.0.push((refused.entity, refused.error.to_string()));
         });
     app.update();
     app
 }
 
 #[derive(Resource, Default)]
-struct Told(Vec<(Entity, String)>);
+struct Received(Vec<(Entity, String)>);
 
 /// Spawns a body together with `bundle`. Its first step is in the next update.
 pub fn spawn(app: &mut App, model: ModalModel, bundle: impl Bundle) -> Entity {
@@ -93,5 +93,5 @@ pub fn tick(app: &App) -> u64 {
 
 /// Returns the refusals since the last call, as text.
 pub fn refusals(app: &mut App) -> Vec<(Entity, String)> {
-    std::mem::take(&mut app.world_mut().resource_mut::<Told>().0)
+    std::mem::take(&mut app.world_mut().resource_mut::<Received>().0)
 }

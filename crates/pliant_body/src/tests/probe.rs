@@ -65,6 +65,6 @@ fn a_probe_wakes_what_it_touches_and_bad_settings_touch_nothing() {
         steps(&mut app, 3);
         assert_eq!(force(&app, probe), DVec3::ZERO);
     }
-    let told = refusals(&mut app);
-    assert!(matches!(&told[..], [(entity, _)] if *entity == probe), "told once: {told:?}");
+    let received = refusals(&mut app);
+    assert!(matches!(&received[..], [(entity, _)] if *entity == probe), "told once: {received:?}");
 }

@@ -33,9 +33,9 @@ fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Du
         lengthen(&mut app, Duration::from_millis(millis));
         steps(&mut app, 2);
     }
-    let told = refusals(&mut app);
-    assert_eq!(told.len(), 1, "{told:?}");
-    assert!(told[0].0 == bad && told[0].1.contains("damping_scale"), "{told:?}");
+    let received = refusals(&mut app);
+    assert_eq!(received.len(), 1, "{received:?}");
+    assert!(received[0].0 == bad && received[0].1.contains("damping_scale"), "{received:?}");
     let config = state(&app, bad).body().config();
     assert_eq!(
         (config.step, config.settings.damping_scale, config.settings.gravity),
@@ -102,8 +102,8 @@ fn a_material_set_on_the_component_relaxes_and_stays_through_other_steps() {
 
     settings(&mut app, body).settings.relaxation = Some(Relaxation { ratio: 1.0, time: 0.2 });
     steps(&mut app, 3);
-    let told = refusals(&mut app);
-    assert!(told.len() == 1 && told[0].1.contains("relaxation ratio"), "{told:?}");
+    let received = refusals(&mut app);
+    assert!(received.len() == 1 && received[0].1.contains("relaxation ratio"), "{received:?}");
     settings(&mut app, body).settings.relaxation = None;
     steps(&mut app, 1);
     assert_eq!(state(&app, body).body().config().settings.relaxation, None);
@@ -154,8 +154,8 @@ fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_t
     assert!((tip(&app) / hangs(2.0) - 1.0).abs() < 1e-3, "{} m", tip(&app));
     settings(&mut app, body).settings.stiffness_scale = 0.0;
     steps(&mut app, 2);
-    let told = refusals(&mut app);
-    assert!(told.len() == 1 && told[0].1.contains("stiffness_scale"), "{told:?}");
+    let received = refusals(&mut app);
+    assert!(received.len() == 1 && received[0].1.contains("stiffness_scale"), "{received:?}");
     assert_eq!(state(&app, body).body().config().settings.stiffness_scale, 2.0);
 }
 
@@ -186,8 +186,8 @@ fn a_model_that_was_refused_is_tried_again_when_its_asset_changes() {
     let body = spawn_with(&mut app, model::stiff_bar(1e13), |body| body.settings.relaxation = material, ());
     steps(&mut app, 3);
     assert!(app.world().get::<BodyState>(body).is_none());
-    let told = refusals(&mut app);
-    assert!(told.len() == 1 && told[0].1.contains("omega"), "{told:?}");
+    let received = refusals(&mut app);
+    assert!(received.len() == 1 && received[0].1.contains("omega"), "{received:?}");
 
     let handle = settings(&mut app, body).bypass_change_detection().model.clone();
     let mut assets = app.world_mut().resource_mut::<Assets<ModalAsset>>();

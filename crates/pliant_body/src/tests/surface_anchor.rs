@@ -130,8 +130,11 @@ fn an_anchor_whose_body_or_place_is_gone_stays_and_says_so_once() {
     steps(&mut app, 3);
     assert_eq!(global(&app, hat), at);
     assert!(app.world().get::<SurfaceAnchor>(hat).is_none());
-    let told = refusals(&mut app);
-    assert!(told.len() == 1 && told[0].0 == hat && told[0].1.contains("stays where it is"), "{told:?}");
+    let received = refusals(&mut app);
+    assert!(
+        received.len() == 1 && received[0].0 == hat && received[0].1.contains("stays where it is"),
+        "{received:?}"
+    );
 
     let body = spawn(&mut app, model::bar(), ());
     let places = [

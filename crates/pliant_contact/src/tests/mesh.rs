@@ -277,6 +277,6 @@ fn a_mesh_that_changes_is_made_anew_and_a_bad_one_is_told_once() {
         app.update();
         std::thread::sleep(std::time::Duration::from_millis(1));
     }
-    let told = &app.world().resource::<Told>().refused;
-    assert_eq!(told.len(), 1, "{told:?}");
+    let received = &app.world().resource::<Received>().refused;
+    assert_eq!(received.len(), 1, "{received:?}");
 }

@@ -65,8 +65,8 @@ fn a_wrong_guess_is_put_right() {
     }
     // The user's setting applies, whether it is right or wrong.
     let service = Service::start(true);
-    let told = InverseConfig { spelling: Some(Spelling::Values), ..second(service.config()) };
-    let mut device = Inverse::open(told).unwrap();
+    let config = InverseConfig { spelling: Some(Spelling::Values), ..second(service.config()) };
+    let mut device = Inverse::open(config).unwrap();
     assert!(device.exchange(&Wrench::ZERO, &mut pacing()).is_err());
     assert_eq!(device.spelling(), Spelling::Values);
 }

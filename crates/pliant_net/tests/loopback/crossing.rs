@@ -295,8 +295,8 @@ fn the_reason_of_the_end_arrives_over_a_link_that_loses_the_last_packet() {
     }
     (0..24).for_each(|_| assert_eq!(closed(&host), DisconnectReason::Kicked));
     drop(host);
-    let mut heard: Vec<DisconnectReason> = guests.iter().map(closed).collect();
-    heard.sort_by_key(|reason| reason.code());
+    let mut reasons: Vec<DisconnectReason> = guests.iter().map(closed).collect();
+    reasons.sort_by_key(|reason| reason.code());
     let (left, kicked) = ([DisconnectReason::Left; 24], [DisconnectReason::Kicked; 24]);
-    assert_eq!(heard, [left, kicked].concat());
+    assert_eq!(reasons, [left, kicked].concat());
 }

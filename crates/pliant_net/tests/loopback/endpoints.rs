@@ -23,10 +23,10 @@ pub fn first(endpoint: &Endpoint) -> Event {
 /// `host` receives.
 pub fn is_first_heard_of(host: &Endpoint) -> Endpoint {
     let guest = guest(&host.invite());
-    let heard = first(host);
+    let received = first(host);
     let own = guest.fingerprint();
-    let so = matches!(heard, Event::Connected { fingerprint, .. } if fingerprint == own);
-    assert!(so, "{heard:?}");
+    let so = matches!(received, Event::Connected { fingerprint, .. } if fingerprint == own);
+    assert!(so, "{received:?}");
     guest
 }
 

@@ -59,11 +59,11 @@ fn tokens_are_asked_for_and_say_the_role() {
     host.set_access(Access::Tokens(Vec::new()));
     assert_eq!(closed(&guest(&invite)), DisconnectReason::UnknownToken);
     inside.send_message(PeerId::HOST, Bytes::from_static(b"still here")).unwrap();
-    let said = next(&host, |event| match event {
+    let message = next(&host, |event| match event {
         Event::Message { bytes, .. } => Some(bytes),
         _ => None,
     });
-    assert_eq!(said, "still here");
+    assert_eq!(message, "still here");
 }
 
 #[test]
@@ -107,10 +107,10 @@ fn another_version_is_refused_in_the_handshake() {
 #[test]
 fn a_guest_without_a_key_is_refused() {
     let host = host();
-    let stranger = UnauthenticatedPeer::new(ALPN, false);
+    let unauthenticated = UnauthenticatedPeer::new(ALPN, false);
     // The client's side of the handshake completes before the host refuses.
-    if let Ok(connection) = stranger.connect(&host) {
-        let error = stranger.runtime.block_on(connection.closed()).to_string();
+    if let Ok(connection) = unauthenticated.connect(&host) {
+        let error = unauthenticated.runtime.block_on(connection.closed()).to_string();
         assert!(
             error.contains("116") || error.contains("certificate"),
             "certificate_required is alert 116: {error}"
@@ -122,15 +122,15 @@ fn a_guest_without_a_key_is_refused() {
 #[test]
 fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applications() {
     let host = host();
-    let stranger = UnauthenticatedPeer::new(ALPN, true);
-    let connection = stranger.connect(&host).unwrap();
+    let unauthenticated = UnauthenticatedPeer::new(ALPN, true);
+    let connection = unauthenticated.connect(&host).unwrap();
     connection.send_datagram(Bytes::from_static(b"early")).unwrap();
     // The datagram is sent before the stream is opened, and packets on loopback stay in order.
     let out = || connection.stats().frame_tx.datagram == 1;
-    stranger.live_until("the early datagram is sent", out);
+    unauthenticated.live_until("the early datagram is sent", out);
     // The guest is not admitted before its token.
     let _other = is_first_heard_of(&host);
-    stranger.runtime.block_on(async {
+    unauthenticated.runtime.block_on(async {
         let (mut send, mut recv) = connection.open_bi().await.unwrap();
         send.write_all(&0u32.to_le_bytes()).await.unwrap();
         let mut welcome = [9; 5];
@@ -139,12 +139,12 @@ fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applicati
         connection.send_datagram(Bytes::from_static(b"\xff\x00garbage")).unwrap();
     });
     connected(&host);
-    let came = stranger.live_until("the first datagram that counts", || host.poll());
+    let came = unauthenticated.live_until("the first datagram that counts", || host.poll());
     assert!(matches!(&came, Event::Datagram { bytes, .. } if bytes == &b"\xff\x00garbage"[..]), "{came:?}");
 
     // The first message is not a token.
-    let second = stranger.connect(&host).unwrap();
-    let error = stranger.runtime.block_on(async {
+    let second = unauthenticated.connect(&host).unwrap();
+    let error = unauthenticated.runtime.block_on(async {
         let (mut send, _recv) = second.open_bi().await.unwrap();
         send.write_all(b"\x05\x00\x00\x00hello").await.unwrap();
         second.closed().await

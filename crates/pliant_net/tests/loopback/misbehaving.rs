@@ -50,11 +50,11 @@ fn garbage_on_the_port_disturbs_nobody() {
     }
     // The system drops packets while the garbage fills the host's socket, so the guest repeats the
     // datagram until it arrives.
-    let heard = wait_for("a datagram gets through", || {
+    let received = wait_for("a datagram gets through", || {
         guest.send_datagram(PeerId::HOST, Bytes::from_static(b"through")).unwrap();
         host.poll()
     });
-    assert!(matches!(&heard, Event::Datagram { bytes, .. } if bytes == "through"), "{heard:?}");
+    assert!(matches!(&received, Event::Datagram { bytes, .. } if bytes == "through"), "{received:?}");
     host.send_datagram(peer, Bytes::from_static(b"and back")).unwrap();
     assert_eq!(datagram(&guest), "and back");
 }
@@ -65,10 +65,10 @@ fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
         Endpoint::host(HostOptions { limits: quick(Limits::host()), ..HostOptions::default() }).unwrap();
     let patient = crate::endpoints::host();
     let start = Instant::now();
-    let stranger = UnauthenticatedPeer::new(ALPN, true);
+    let unauthenticated = UnauthenticatedPeer::new(ALPN, true);
     let connections = [&patient, &host].map(|host| {
-        let connection = stranger.connect(host).unwrap();
-        stranger.runtime.block_on(async {
+        let connection = unauthenticated.connect(host).unwrap();
+        unauthenticated.runtime.block_on(async {
             let (mut send, mut recv) = connection.open_bi().await.unwrap();
             send.write_all(&0u32.to_le_bytes()).await.unwrap();
             let mut welcome = [9; 5];
@@ -167,15 +167,15 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     connected(&host);
     // Another address of this machine stands for an attacker's address. It opens 1,000 handshakes,
     // and none of them sends anything afterwards.
-    let stranger = UnauthenticatedPeer::new(ALPN, true);
+    let unauthenticated = UnauthenticatedPeer::new(ALPN, true);
     let target = SocketAddr::from(([127, 0, 0, 1], port));
     let began = Instant::now();
-    let open = stranger.runtime.block_on(async {
+    let open = unauthenticated.runtime.block_on(async {
         let socket = UdpSocket::bind("127.0.0.2:0").unwrap();
-        stranger.endpoint.rebind(socket).unwrap();
+        unauthenticated.endpoint.rebind(socket).unwrap();
         let mut attempts = tokio::task::JoinSet::new();
         for _ in 0..1000 {
-            let connecting = stranger.endpoint.connect(target, "pliant").unwrap();
+            let connecting = unauthenticated.endpoint.connect(target, "pliant").unwrap();
             attempts.spawn(async move { connecting.await.ok() });
         }
         let mut open = Vec::new();
@@ -187,7 +187,7 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     // Twice as many as there are places may arrive at once, and half as many each second.
     let arrived = 16 + 4 * (1 + began.elapsed().as_secs() as usize);
     assert!(open.len() <= arrived, "{} got as far as a handshake, not {arrived}", open.len());
-    let places = stranger.live_until("eight have a place", || {
+    let places = unauthenticated.live_until("eight have a place", || {
         let left = open.iter().filter(|connection| connection.close_reason().is_none()).count();
         (left <= 8).then_some(left)
     });
@@ -211,13 +211,13 @@ fn silent_connections_bar_nobody_and_who_has_spoken_stays() {
     let (peer, _) = connected(&host);
     present.send_message(PeerId::HOST, Bytes::from_static(b"hello")).unwrap();
     assert_eq!(message(&host), "hello");
-    let stranger = UnauthenticatedPeer::new(ALPN, true);
+    let unauthenticated = UnauthenticatedPeer::new(ALPN, true);
     // Half of them show no token, and the other half show one and say nothing more.
     let connections: Vec<quinn::Connection> = (0..64)
         .map(|k| {
-            let connection = stranger.connect(&host).unwrap();
+            let connection = unauthenticated.connect(&host).unwrap();
             if k % 2 == 1 {
-                stranger.runtime.block_on(async {
+                unauthenticated.runtime.block_on(async {
                     let (mut send, recv) = connection.open_bi().await.unwrap();
                     send.write_all(&0u32.to_le_bytes()).await.unwrap();
                     std::mem::forget((send, recv));
@@ -227,12 +227,12 @@ fn silent_connections_bar_nobody_and_who_has_spoken_stays() {
         })
         .collect();
     let newcomer = guest(&host.invite());
-    stranger.live_until("a newcomer gets in", || match newcomer.poll() {
+    unauthenticated.live_until("a newcomer gets in", || match newcomer.poll() {
         Some(Event::Closed { reason, .. }) => panic!("the newcomer is not let in: {reason}"),
         event => event.is_some(),
     });
     newcomer.send_message(PeerId::HOST, Bytes::from_static(b"newcomer")).unwrap();
-    stranger.live_until("it is heard", || match host.poll() {
+    unauthenticated.live_until("it is heard", || match host.poll() {
         Some(Event::Message { bytes, .. }) => bytes == "newcomer",
         _ => false,
     });

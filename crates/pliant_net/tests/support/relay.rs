@@ -46,7 +46,7 @@ impl TestRelay {
         certificate: Certificate,
         publish: impl FnOnce(&origin::Producer) + Send + 'static,
     ) -> Self {
-        let (tell, told) = sync_channel(1);
+        let (sender, receiver) = sync_channel(1);
         let (end, ended) = oneshot::channel();
         let own = certificate.clone();
         let thread = thread::spawn(move || {
@@ -54,7 +54,7 @@ impl TestRelay {
             let tasks = tokio::task::LocalSet::new();
             runtime.block_on(tasks.run_until(async move {
                 let endpoint = endpoint(port, &own).await;
-                tell.send(endpoint.local_addr().unwrap().port()).unwrap();
+                sender.send(endpoint.local_addr().unwrap().port()).unwrap();
                 let (origin, driver) = origin::Producer::new(origin::Config::default());
                 tokio::task::spawn_local(moq_net::time::run(driver));
                 publish(&origin);
@@ -67,7 +67,7 @@ impl TestRelay {
             }));
             drop(tasks);
         });
-        let port = told.recv().unwrap();
+        let port = receiver.recv().unwrap();
         let hash = certificate.hash();
         Self { port, certificate, hash, end: Some(end), thread: Some(thread) }
     }

@@ -20,7 +20,7 @@ fn lone(user: UserId, founds: bool) -> PeerSession {
 }
 
 /// Delivers the messages of `from`, which `to` knows as `peer`. Returns their number.
-fn tell(from: &mut PeerSession, to: &mut PeerSession, peer: PeerId) -> usize {
+fn deliver(from: &mut PeerSession, to: &mut PeerSession, peer: PeerId) -> usize {
     let messages = std::iter::from_fn(|| from.poll_output()).filter(|out| out.channel == Channel::Message);
     messages.map(|out| to.on_message(100 * MS, peer, &out.bytes)).count()
 }
@@ -142,30 +142,30 @@ fn a_new_peer_is_given_its_number_and_those_who_come_before_wait_for_it() {
     // Another peer was told of the new one before the new one has its number.
     early.connect(Duration::ZERO, PeerId(2), UserId(2), 1200).unwrap();
     new.accept(Duration::ZERO, PeerId(3), 1200).unwrap();
-    assert_eq!(tell(&mut early, &mut new, PeerId(3)), 1);
+    assert_eq!(deliver(&mut early, &mut new, PeerId(3)), 1);
     // It cannot give the new peer a number either, which has not asked it.
     let mut liar = lone(UserId::HOST, false);
     liar.accept(Duration::ZERO, PeerId(3), 1200).unwrap();
     early.disconnect(PeerId(2), DisconnectReason::Left);
     early.connect(Duration::ZERO, PeerId(2), UserId(2), 1200).unwrap();
-    tell(&mut early, &mut liar, PeerId(3));
+    deliver(&mut early, &mut liar, PeerId(3));
     liar.on_message(MS, PeerId(3), &PeerMessage::Welcome { user: 9, others: Vec::new() }.encode());
     let turned = PeerEvent::TurnedAway { peer: PeerId(3), reason: DisconnectReason::Protocol };
     assert_eq!(liar.poll_event(), Some(turned));
 
-    assert_eq!(tell(&mut new, &mut first, PeerId(2)), 1, "the new peer greets only whom it asks");
+    assert_eq!(deliver(&mut new, &mut first, PeerId(2)), 1, "the new peer greets only whom it asks");
     assert_eq!(first.poll_event(), Some(PeerEvent::JoinRequest { peer: PeerId(2) }));
     assert!(first.welcome(PeerId(2), UserId(1), &[]).is_err(), "the first peer's own number");
     let others = [(UserId(3), "there".to_owned())];
     first.welcome(PeerId(2), UserId(2), &others).unwrap();
     assert_eq!(first.user_of(PeerId(2)), Some(UserId(2)));
     first.update(300 * MS);
-    assert_eq!(tell(&mut first, &mut new, PeerId(1)), 3, "hello, welcome and state");
+    assert_eq!(deliver(&mut first, &mut new, PeerId(1)), 3, "hello, welcome and state");
     assert_eq!(new.poll_event(), Some(PeerEvent::Welcomed { user: UserId(2), others: others.to_vec() }));
     assert_eq!((new.user_of(PeerId(1)), new.user_of(PeerId(3))), (Some(UserId(1)), Some(UserId(3))));
     assert!(new.tick() > 0, "it has the state");
     // The peer that waited is answered under the new number.
-    assert_eq!(tell(&mut new, &mut early, PeerId(2)), 1);
+    assert_eq!(deliver(&mut new, &mut early, PeerId(2)), 1);
     assert_eq!(early.user_of(PeerId(2)), Some(UserId(2)));
 }
 
