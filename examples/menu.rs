@@ -47,7 +47,7 @@ struct Menu {
     name: String,
     invite: String,
     /// Why there is no session any more, or none yet.
-    told: String,
+    message: String,
 }
 
 fn main() {
@@ -58,7 +58,7 @@ fn main() {
         .add_plugins(stage)
         .add_plugins((PliantPlugins::default(), NetPlugin::default()))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
-        .insert_resource(Menu { name: options.name, invite: options.invite, told: String::new() })
+        .insert_resource(Menu { name: options.name, invite: options.invite, message: String::new() })
         .add_observer(joined)
         .add_observer(closed)
         .add_observer(failed)
@@ -103,7 +103,7 @@ fn show(
     window.show(contexts.ctx_mut()?, |ui| {
         match *state {
             SessionState::Idle => {
-                ui.label(&menu.told);
+                ui.label(&menu.message);
                 if ui.button("Host").clicked() {
                     host_session(&mut commands, menu);
                 }
@@ -137,12 +137,12 @@ fn show(
 }
 
 fn host_session(commands: &mut Commands, menu: &mut Menu) {
-    menu.told.clear();
+    menu.message.clear();
     commands.host_session(HostConfig { name: menu.name.clone(), ..default() });
 }
 
 fn join_session(commands: &mut Commands, menu: &mut Menu) {
-    menu.told.clear();
+    menu.message.clear();
     commands.join_session(menu.invite.as_str(), JoinConfig { name: menu.name.clone(), ..default() });
 }
 
@@ -155,14 +155,14 @@ fn joined(joined: On<SessionJoined>, host: Option<Res<NetHost>>) {
 
 /// Clears what the session has displayed, also where the user has not asked to leave.
 fn closed(closed: On<SessionClosed>, mut commands: Commands, mut menu: ResMut<Menu>) {
-    menu.told = format!("The session is over: {}", closed.reason);
-    println!("{}", menu.told);
+    menu.message = format!("The session is over: {}", closed.reason);
+    println!("{}", menu.message);
     commands.leave_session();
 }
 
 fn failed(failed: On<SessionFailed>, mut commands: Commands, mut menu: ResMut<Menu>) {
-    menu.told = failed.reason.to_string();
-    println!("failed: {}", menu.told);
+    menu.message = failed.reason.to_string();
+    println!("failed: {}", menu.message);
     commands.leave_session();
 }
 
@@ -184,7 +184,7 @@ fn play_the_user(
         (0, SessionState::Idle) => host_session(&mut commands, &mut menu),
         (2, SessionState::Idle) if !menu.invite.is_empty() => join_session(&mut commands, &mut menu),
         (2, SessionState::Idle) => *step = 3,
-        (3, SessionState::Idle) if !menu.told.is_empty() => {}
+        (3, SessionState::Idle) if !menu.message.is_empty() => {}
         (4, SessionState::Idle) => host_session(&mut commands, &mut menu),
         (1 | 3, SessionState::Hosting | SessionState::Joined) if now > *since + STAY => {
             commands.leave_session();

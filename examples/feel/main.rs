@@ -252,14 +252,14 @@ fn read_out(
         at.x,
         at.y,
         at.z,
-        figures(&status.report),
+        loop_metrics(&status.report),
         trace.largest,
         trace.largest_step,
     );
 }
 
 /// Returns the force, the energy, and how well the device loop keeps its time.
-fn figures(report: &LoopReport) -> String {
+fn loop_metrics(report: &LoopReport) -> String {
     let tick = &report.tick;
     let norm = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
     let us = |s: f64| s * 1e6;

@@ -127,7 +127,7 @@ fn main() -> ExitCode {
 fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
     options.stage.headless |= cfg!(not(feature = "window"));
     if options.bots.is_none() && options.compare.is_empty() {
-        options.stage.settle()?;
+        options.stage.check_window()?;
     }
     let options = &options;
     let shipped = || session::model(&options.body);
@@ -184,7 +184,7 @@ fn finish(app: &mut App, options: &Options) -> Result<(), Box<dyn Error>> {
     }
     app.insert_resource(session::EndAfter { seconds: options.stage.seconds, frames: options.stage.frames })
         .add_systems(Last, session::end)
-        .add_systems(Update, tell);
+        .add_systems(Update, print_events);
     if options.stage.headless && !options.still && options.replay.is_none() {
         let number = options.seed;
         let script = move |mut commands: Commands, bodies: Query<Entity, Added<RemoteBody>>| {
@@ -198,7 +198,7 @@ fn finish(app: &mut App, options: &Options) -> Result<(), Box<dyn Error>> {
 }
 
 /// Prints the events of the session and ends the app with it.
-fn tell(
+fn print_events(
     time: Res<Time<Real>>,
     mut joined: MessageReader<SessionJoined>,
     mut lost: MessageReader<SessionLost>,

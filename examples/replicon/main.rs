@@ -72,13 +72,13 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     world.commands().join_session_over(carrier, JoinConfig::default());
     pair.client.add_systems(Update, hold);
 
-    let (began, mut told) = (Instant::now(), 0);
+    let (began, mut printed) = (Instant::now(), 0);
     while began.elapsed().as_secs_f64() < options.seconds {
         pair.update();
         std::thread::sleep(Duration::from_millis(4));
-        if began.elapsed().as_secs() > told {
-            told = began.elapsed().as_secs();
-            tell(&mut pair, told);
+        if began.elapsed().as_secs() > printed {
+            printed = began.elapsed().as_secs();
+            print_forces(&mut pair, printed);
         }
     }
     Ok(())
@@ -103,7 +103,7 @@ fn hold(
     }
 }
 
-fn tell(pair: &mut pair::Pair, second: u64) {
+fn print_forces(pair: &mut pair::Pair, second: u64) {
     let forces = [&mut pair.server, &mut pair.client].map(|app| {
         let mut forces = app.world_mut().query::<&GrabForce>();
         forces.iter(app.world()).next().map_or(0.0, |force| force.force.length())

@@ -51,7 +51,7 @@ struct Title(String);
 
 fn main() -> AppExit {
     let options = Options::parse();
-    let told = |error: &SceneError| {
+    let report = |error: &SceneError| {
         eprintln!("{error}");
         AppExit::from_code(2)
     };
@@ -68,7 +68,7 @@ fn main() -> AppExit {
     let mut stage = Stage::with("a scene from a file", options.stage).picture_at(4.0).key("left mouse: pull");
     let (file, scene) = match SceneFilePlugin::open(file.clone()).map(|scene| (file, scene)) {
         Ok(both) => both,
-        Err(error) => return told(&error),
+        Err(error) => return report(&error),
     };
     #[cfg(feature = "net")]
     if let Some(invite) = scene.invite() {

@@ -67,7 +67,7 @@ fn publish(
     mut wanted: ResMut<Wanted>,
     host: Option<ResMut<NetHost>>,
     mut exit: MessageWriter<AppExit>,
-    mut said: Local<u64>,
+    mut reported: Local<u64>,
 ) {
     let Some(mut host) = host else { return };
     if let Some((options, link)) = wanted.0.take() {
@@ -80,9 +80,9 @@ fn publish(
         }
     }
     if let Some((_, stats)) = host.published()
-        && stats.connections != *said
+        && stats.connections != *reported
     {
-        *said = stats.connections;
+        *reported = stats.connections;
         println!("connected to the relay");
     }
 }

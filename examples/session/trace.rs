@@ -61,9 +61,9 @@ pub fn write_truth(
     for state in &bodies {
         let q = state.body().q();
         let mut written = trace.put(tick.0, UserId::HOST, None, q);
-        for (felt, of) in &hands {
+        for (grab_force, of) in &hands {
             if let Ok(user) = users.get(of.0) {
-                written = written.and(trace.put(tick.0, user.id, Some(felt.force), q));
+                written = written.and(trace.put(tick.0, user.id, Some(grab_force.force), q));
             }
         }
         if let Err(error) = written {
@@ -93,11 +93,11 @@ pub fn write_shown(
             trace.last = view.tick();
             written = trace.put(view.tick(), UserId::HOST, None, &streamed.q);
         }
-        if let (Some((tick, state)), Some(felt)) = (guest.visual_state(*body), forces.iter().next())
+        if let (Some((tick, state)), Some(grab_force)) = (guest.visual_state(*body), forces.iter().next())
             && tick > trace.last_held
         {
             trace.last_held = tick;
-            written = written.and(trace.put(tick, user, Some(felt.force), &state.q));
+            written = written.and(trace.put(tick, user, Some(grab_force.force), &state.q));
         }
         if let Err(error) = written {
             warn_once!("the trace is not whole: {error}");
@@ -209,19 +209,19 @@ fn percent(x: f64, of: f64) -> f64 {
 ///
 /// The errors of the shapes are relative to the largest true displacement, separately for the
 /// streamed body and for the body with the predicted hand. The errors of the reactions are relative
-/// to the largest true reaction. The longest time in which the streamed body was off by more than
-/// 1 % (rms over its surface) is told in ticks. The first `skip` ticks of the guest are left out.
+/// to the largest true reaction. The longest time in which the streamed body was off by more than 1
+/// % (rms over its surface) is printed in ticks. The first `skip` ticks of the guest are left out.
 pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> Result<(), Box<dyn Error>> {
     let (truth, shown) = (read(truth)?, read(shown)?);
     let (mut streamed, mut own) = (Off::default(), Off::default());
-    let (mut felt, mut force_sum, mut force_worst, mut force_most) = (0u64, 0.0f64, 0.0f64, 0.0f64);
+    let (mut compared, mut force_sum, mut force_worst, mut force_most) = (0u64, 0.0f64, 0.0f64, 0.0f64);
     let host = UserId::HOST.0;
-    // The largest reaction that the user was told of, and the largest true one at any tick.
-    let (mut told, mut owner) = (0.0f64, host);
+    // The largest reaction displayed to the user, and the largest true one at any tick.
+    let (mut displayed, mut owner) = (0.0f64, host);
     let first = shown.keys().filter(|key| key.1 == host).nth(skip).map_or(u64::MAX, |key| key.0);
     for (&(tick, user), line) in shown.range((first, 0)..) {
         if user != host && line.reaction.is_finite() {
-            told = told.max(f64::from(line.reaction.length()));
+            displayed = displayed.max(f64::from(line.reaction.length()));
             owner = user;
         }
         let Some(real) = truth.get(&(tick, host)) else { continue };
@@ -231,7 +231,7 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
             truth.get(&(tick, user)).filter(|real| real.reaction.is_finite() && line.reaction.is_finite())
         {
             let error = f64::from(real.reaction.distance(line.reaction));
-            felt += 1;
+            compared += 1;
             force_sum += error * error;
             force_worst = force_worst.max(error);
             force_most = force_most.max(f64::from(real.reaction.length()));
@@ -247,15 +247,15 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
         truth.range((first, 0)..).filter(|((_, user), line)| *user == owner && line.reaction.is_finite());
     let given = given.map(|(_, line)| f64::from(line.reaction.length())).fold(0.0, f64::max);
     println!(
-        "{} of {span} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
+        "{} of {span} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({compared} ticks); \
          predicted hand against the later state of the host, {:.2} % rms; \
-         largest reaction {told:.2} N shown, {given:.2} N true; \
+         largest reaction {displayed:.2} N shown, {given:.2} N true; \
          shape off by more than 1 % for {} ticks at most",
         streamed.ticks,
         streamed.rms(),
         percent(streamed.worst, streamed.largest),
         streamed.largest * 1e3,
-        percent((force_sum / felt.max(1) as f64).sqrt(), force_most),
+        percent((force_sum / compared.max(1) as f64).sqrt(), force_most),
         percent(force_worst, force_most),
         own.rms(),
         streamed.longest(),

@@ -67,7 +67,7 @@ pub struct GuestBody;
 
 /// The newest metrics, for the corner of the window and for the recording.
 #[derive(Resource, Default)]
-pub struct Figures {
+pub struct Metrics {
     pub joined: bool,
     pub loss: f64,
     pub round_trip: f64,
@@ -150,7 +150,7 @@ fn run(mut app: App, guest: Guest) -> GuestReport {
         .insert_resource(Time::<Fixed>::from_hz(RATE))
         .insert_resource(guest.truth)
         .init_resource::<Meters>()
-        .init_resource::<Figures>()
+        .init_resource::<Metrics>()
         .insert_resource(Run {
             duration: guest.duration,
             frames: guest.stage.frames,
@@ -194,7 +194,7 @@ fn measure(
     stats: Res<NetStats>,
     truth: Res<Truth>,
     mut meters: ResMut<Meters>,
-    mut figures: ResMut<Figures>,
+    mut metrics: ResMut<Metrics>,
     mut run: ResMut<Run>,
     time: Res<Time<Real>>,
     bodies: Query<(&RemoteBody, &BodyState), With<GuestBody>>,
@@ -204,15 +204,15 @@ fn measure(
     if let GuestState::Closed { reason } = guest.state() {
         run.failure.get_or_insert_with(|| reason.to_string());
     }
-    figures.loss = stats.loss_in;
-    figures.round_trip = stats.round_trip.as_secs_f64();
-    figures.kbit_s = stats.bytes_in_per_s * 8e-3;
-    figures.reaction = forces.iter().map(|f| f.force.length()).fold(0.0, f64::max);
-    meters.reaction = meters.reaction.max(figures.reaction);
+    metrics.loss = stats.loss_in;
+    metrics.round_trip = stats.round_trip.as_secs_f64();
+    metrics.kbit_s = stats.bytes_in_per_s * 8e-3;
+    metrics.reaction = forces.iter().map(|f| f.force.length()).fold(0.0, f64::max);
+    meters.reaction = meters.reaction.max(metrics.reaction);
     for (remote, state) in &bodies {
         let Some(view) = guest.body(*remote) else { continue };
         let Some(streamed) = view.visual() else { continue };
-        figures.joined = true;
+        metrics.joined = true;
         if !std::mem::replace(&mut run.seen, true) {
             run.missing.fetch_sub(1, Ordering::Relaxed);
         }
@@ -220,10 +220,10 @@ fn measure(
             run.since.get_or_insert(time.elapsed_secs_f64());
         }
         meters.streamed.show(view.tick(), &streamed.q);
-        figures.ahead = 0.0;
+        metrics.ahead = 0.0;
         if let Some(own) = view.predicted_hand() {
             // The host has yet to reach this tick; the shape is compared when it has.
-            figures.ahead = own.tick().saturating_sub(view.tick()) as f64 / RATE;
+            metrics.ahead = own.tick().saturating_sub(view.tick()) as f64 / RATE;
             meters.predicted_hand.show(own.tick(), &own.visual().q);
             meters.waiting.show(own.tick(), &streamed.q);
         }
@@ -273,8 +273,8 @@ fn surface_point(model: &ModalModel, vertex: u32, q: &[f64]) -> Vec3 {
 }
 
 /// Records the errors; the rerun plugin records shapes, forces and network metrics by itself.
-fn record(figures: Res<Figures>, meters: Res<Meters>, mut scalars: ResMut<RerunScalars>) {
-    if !figures.joined {
+fn record(metrics: Res<Metrics>, meters: Res<Meters>, mut scalars: ResMut<RerunScalars>) {
+    if !metrics.joined {
         return;
     }
     for (name, meter) in [("streamed", &meters.streamed), ("predicted hand", &meters.predicted_hand)] {

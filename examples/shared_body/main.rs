@@ -70,7 +70,7 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let mut options = options.clone();
-    options.stage.settle()?;
+    options.stage.check_window()?;
     let path = Path::new(stage::ASSETS).join(&options.body);
     let model = Arc::new(ModalModel::read(path)?);
 

@@ -7,7 +7,7 @@ use bevy::{
 use pliant::{prelude::*, rerun::RerunStyle};
 
 use crate::{
-    guest::{Figures, GuestBody},
+    guest::{GuestBody, Metrics},
     meter::{Meters, Truth},
     stage::{Look, Readout, Setting},
 };
@@ -36,7 +36,7 @@ impl Plugin for ViewPlugin {
         })
         .insert_resource(Readout("joining ...".into()))
         .insert_resource(GhostOn(true))
-        .add_systems(Update, (dress, ghost_follows, keys, draw_hands, write_figures, frame_body).chain());
+        .add_systems(Update, (dress, ghost_follows, keys, draw_hands, write_metrics, frame_body).chain());
     }
 }
 
@@ -140,8 +140,8 @@ fn draw_hands(mut gizmos: Gizmos, bodies: Query<(&HeldBy, &BodyState), With<Gues
     }
 }
 
-fn write_figures(figures: Res<Figures>, meters: Res<Meters>, mut readout: ResMut<Readout>) {
-    if !figures.joined {
+fn write_metrics(metrics: Res<Metrics>, meters: Res<Meters>, mut readout: ResMut<Readout>) {
+    if !metrics.joined {
         return;
     }
     let streamed = &meters.streamed;
@@ -153,13 +153,13 @@ fn write_figures(figures: Res<Figures>, meters: Res<Meters>, mut readout: ResMut
          prediction      {:6.0} ms\n\
          reaction        {:6.2} N\n\
          received        {:6.1} kbit/s",
-        100.0 * figures.loss,
-        1e3 * figures.round_trip,
+        100.0 * metrics.loss,
+        1e3 * metrics.round_trip,
         streamed.percent(streamed.now),
         streamed.percent(streamed.rms()),
-        1e3 * figures.ahead,
-        figures.reaction,
-        figures.kbit_s,
+        1e3 * metrics.ahead,
+        metrics.reaction,
+        metrics.kbit_s,
     );
 }
 

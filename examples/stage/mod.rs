@@ -56,7 +56,7 @@ impl Stage {
 
     /// Creates a stage for an example that has flattened the stage's [`Options`] into its own.
     pub fn with(title: &'static str, mut options: Options) -> Self {
-        if let Err(error) = options.settle() {
+        if let Err(error) = options.check_window() {
             eprintln!("{title}: {error}");
             std::process::exit(2);
         }
@@ -112,7 +112,7 @@ impl PluginGroup for Stage {
     fn build(self) -> PluginGroupBuilder {
         let plugins = DefaultPlugins.build().set(AssetPlugin { file_path: ASSETS.into(), ..default() });
         let plugins = if self.options.headless {
-            let pace = Duration::from_millis(if self.real_time { 4 } else { 0 });
+            let pause = Duration::from_millis(if self.real_time { 4 } else { 0 });
             plugins
                 .set(LogPlugin {
                     level: Level::WARN,
@@ -130,7 +130,7 @@ impl PluginGroup for Stage {
                     ..default()
                 })
                 .disable::<WinitPlugin>()
-                .add(ScheduleRunnerPlugin::run_loop(pace))
+                .add(ScheduleRunnerPlugin::run_loop(pause))
         } else {
             plugins
                 .set(WindowPlugin {

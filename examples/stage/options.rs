@@ -91,7 +91,7 @@ impl Options {
     }
 
     /// Falls back to no window if none can be opened and drawn in.
-    pub fn settle(&mut self) -> Result<(), String> {
+    pub fn check_window(&mut self) -> Result<(), String> {
         if !self.headless
             && let Some(fault) = fault()
         {

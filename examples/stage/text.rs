@@ -10,7 +10,7 @@ use bevy::prelude::*;
 pub struct Readout(pub String);
 
 #[derive(Component)]
-struct Figures {
+struct ReadoutText {
     title: String,
 }
 
@@ -47,7 +47,7 @@ fn spawn(mut commands: Commands, title: &str, keys: &str) {
     commands.spawn(panel(px(14), Val::Auto)).with_child((
         Text::new(title),
         font(15.0),
-        Figures { title: title.into() },
+        ReadoutText { title: title.into() },
     ));
     commands.spawn(panel(Val::Auto, px(14))).with_child((
         Text::new(keys),
@@ -56,8 +56,8 @@ fn spawn(mut commands: Commands, title: &str, keys: &str) {
     ));
 }
 
-fn write(readout: Res<Readout>, mut texts: Query<(&mut Text, &Figures)>) {
-    for (mut text, figures) in &mut texts {
-        text.0 = [figures.title.as_str(), readout.0.as_str()].join("\n").trim_end().to_owned();
+fn write(readout: Res<Readout>, mut texts: Query<(&mut Text, &ReadoutText)>) {
+    for (mut text, readout_text) in &mut texts {
+        text.0 = [readout_text.title.as_str(), readout.0.as_str()].join("\n").trim_end().to_owned();
     }
 }

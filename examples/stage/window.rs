@@ -46,9 +46,9 @@ fn find() -> Option<String> {
 /// Waits for the process that tries, and returns its fault.
 fn outcome(mut tries: Child) -> Option<String> {
     let mut stderr = tries.stderr.take()?;
-    let told = thread::spawn(move || {
+    let output = thread::spawn(move || {
         let mut text = Vec::new();
-        // What cannot be read is not told.
+        // What cannot be read is left out.
         stderr.read_to_end(&mut text).ok();
         String::from_utf8_lossy(&text).into_owned()
     });
@@ -68,8 +68,8 @@ fn outcome(mut tries: Child) -> Option<String> {
     if status.success() {
         return None;
     }
-    let told = told.join().unwrap_or_default();
-    let panic = told.lines().skip_while(|line| !line.contains(" panicked at ")).nth(1);
+    let output = output.join().unwrap_or_default();
+    let panic = output.lines().skip_while(|line| !line.contains(" panicked at ")).nth(1);
     Some(match panic {
         Some(text) if text.contains("XOpenDisplayFailed") => {
             let display = std::env::var("DISPLAY").unwrap_or_default();

@@ -61,7 +61,7 @@ pub fn start(
             .insert_resource(Time::<Fixed>::from_hz(40.0))
             .insert_resource(other)
             .add_systems(FixedUpdate, pull.before(PliantSystems::Input))
-            .add_systems(Last, tell)
+            .add_systems(Last, update_view)
             .run();
     };
     Ok(thread::Builder::new().name("right".into()).spawn(run)?)
@@ -110,7 +110,7 @@ fn pull(
     }
 }
 
-fn tell(
+fn update_view(
     other: Res<Other>,
     bodies: Query<&VisualState, With<RemoteBody>>,
     hands: Query<(&Grab, &GrabForce)>,

@@ -82,10 +82,10 @@ fn main() -> ExitCode {
                     };
                     let d = drag(config);
                     let star = if d.oscillates() { "*" } else { "" };
-                    let figures = [d.speeds[1] * 1e3, d.given * 1e3, 100.0 * d.step[0] / d.step[1]];
+                    let metrics = [d.speeds[1] * 1e3, d.given * 1e3, 100.0 * d.step[0] / d.step[1]];
                     bad += u32::from(!d.keeps_its_promises());
-                    row += &format!(" {:.1}{star} / {:.2} / {:.0} |", figures[0], figures[1], figures[2]);
-                    of_trip.iter_mut().zip(figures).for_each(|(worst, x)| *worst = worst.max(x));
+                    row += &format!(" {:.1}{star} / {:.2} / {:.0} |", metrics[0], metrics[1], metrics[2]);
+                    of_trip.iter_mut().zip(metrics).for_each(|(worst, x)| *worst = worst.max(x));
                 }
                 if !summary {
                     println!("{row}");
