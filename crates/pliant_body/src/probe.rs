@@ -71,7 +71,7 @@ pub struct ProbeState {
     /// Scale of the bodies that it touches.
     scale: f64,
     obstacles: Vec<Entity>,
-    /// Whether the settings were refused, so that it is told once.
+    /// Whether the settings were refused, so that it is reported once.
     refused: bool,
 }
 

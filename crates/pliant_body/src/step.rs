@@ -182,7 +182,8 @@ pub(crate) fn clear_grab_force(removed: On<Remove, GrabOf>, mut forces: Query<&m
     feel_nothing(removed.entity, &mut forces);
 }
 
-/// Sets the forces of the grabs on a removed body to zero, and tells that they are released.
+/// Sets the forces of the grabs on a removed body to zero, and triggers the events of their
+/// release.
 pub(crate) fn lose_body(
     removed: On<Remove, BodyState>,
     mut commands: Commands,

@@ -109,7 +109,7 @@ pub struct ContactEnded {
 pub(crate) struct Nearby {
     #[entities]
     pub(crate) slots: Vec<Option<Entity>>,
-    /// BodyFriction that was refused, so that it is told once.
+    /// The friction that was refused, so that it is reported once.
     refused: Option<f64>,
 }
 
@@ -331,7 +331,7 @@ pub(crate) fn touch_bodies(
     }
 }
 
-/// Writes the contacts of each body and tells what began and what ended.
+/// Writes the contacts of each body and triggers the events of what began and what ended.
 pub(crate) fn publish(
     time: Res<Time>,
     mut commands: Commands,
@@ -349,7 +349,7 @@ pub(crate) fn publish(
             let other = match contact.other {
                 modal::Touched::Obstacle(index) => nearby.slots.get(index).copied().flatten()?,
                 modal::Touched::Body(bits) => Entity::try_from_bits(bits)?,
-                // What a hand's probe does is told there.
+                // The contacts of a hand's probe are reported there.
                 modal::Touched::Probe(_) => return None,
             };
             Some(ContactPoint {

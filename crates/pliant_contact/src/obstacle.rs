@@ -83,7 +83,7 @@ impl ContactLayers {
     }
 }
 
-/// The shape of an obstacle, as far as its component tells it, or its triangles.
+/// The shape of an obstacle, as far as its component describes it, or its triangles.
 #[derive(Debug, Clone)]
 enum Shape {
     Plain(Obstacle),
@@ -186,7 +186,7 @@ impl Motion {
         let (shape, scale) = (Shape::Collider(shape), DVec3::ONE);
         let now =
             Self { shape, scale, position, rotation, velocity, spin, rigid, changed: true, sound: true };
-        // What moves is told anew at each step, so that the bodies near it stay awake with it.
+        // What moves is passed on anew at each step, so that the bodies near it stay awake with it.
         let same =
             |last: &Self| Self { changed: last.changed, sound: last.sound, ..now.clone() } == *last && !awake;
         let changed = last.is_none_or(|last| !same(last));

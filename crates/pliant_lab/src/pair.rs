@@ -283,7 +283,7 @@ impl Pair {
     }
 
     /// Replaces the host by a new one, as when its process was killed and started again. Its ticks
-    /// begin anew. Nothing passes from and to the guests of before, and they are not told.
+    /// begin anew. Nothing passes from and to the guests of before, and they get no goodbye.
     pub fn restart_host(&mut self, host: HostSession) {
         self.host = host;
         self.tick = 0;

@@ -101,7 +101,7 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
     let away = |v: u32| (0..3).map(|k| (f64::from(positions[v as usize][k]) - pull.at[k]).powi(2)).sum();
     let distance: Vec<f64> = (0..positions.len() as u32).map(away).collect();
     let closest = (0..distance.len()).min_by(|&a, &b| distance[a].total_cmp(&distance[b])).unwrap_or(0);
-    // Such a point was most likely told in another unit.
+    // Such a point was most likely given in another unit.
     let far = distance.get(closest).map_or(f64::INFINITY, |d2: &f64| d2.sqrt());
     if far > model.size() {
         return Err(LabError::Far { away: far, size: model.size() });

@@ -198,7 +198,7 @@ impl Plugin for NetPlugin {
     }
 }
 
-/// `Last`: updates the metrics of this frame, and tells of impulses that no session took.
+/// `Last`: updates the metrics of this frame, and logs impulses that no session took.
 fn measure(
     host: Option<ResMut<NetHost>>,
     mut guest: Option<ResMut<NetGuest>>,

@@ -29,7 +29,7 @@ use crate::user::{UserJoined, UserLeft};
 ///
 /// A command takes effect in the next `PreUpdate`, and no frame waits for it: sockets are opened
 /// and closed on threads. A session that the app is in, or is about to join, is left first. What
-/// becomes of the session is seen in [`SessionState`] and heard in [`SessionJoined`],
+/// becomes of the session is in [`SessionState`] and in the events [`SessionJoined`],
 /// [`SessionLost`], [`SessionClosed`] and [`SessionFailed`].
 ///
 /// ```

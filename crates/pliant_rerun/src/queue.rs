@@ -31,7 +31,7 @@ pub(crate) enum Refused<T> {
 #[derive(Debug)]
 pub(crate) struct FrameSender<T> {
     frames: Option<Sender<T>>,
-    /// Wakes the worker. Dropping it tells the worker that no frame follows.
+    /// Wakes the worker. Dropping it lets the worker know that no frame follows.
     nudge: Option<Sender<()>>,
     dropped: u64,
 }

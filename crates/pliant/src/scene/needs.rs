@@ -30,8 +30,8 @@ impl SceneFile {
     /// # use pliant::scene::SceneFile;
     /// let scene = SceneFile::from_ron("(bodies: [], recording: (file: \"out.rrd\"))", "my.ron")?;
     /// assert!(scene.lacking(|_| true).is_empty());
-    /// let told = scene.lacking(|feature| feature != "rerun")[0].to_string();
-    /// assert!(told.starts_with("my.ron:1:25: this scene asks for a recording, and this program was compiled without `rerun`"), "{told}");
+    /// let error = scene.lacking(|feature| feature != "rerun")[0].to_string();
+    /// assert!(error.starts_with("my.ron:1:25: this scene asks for a recording, and this program was compiled without `rerun`"), "{error}");
     /// # Ok::<(), pliant::scene::SceneError>(())
     /// ```
     pub fn lacking(&self, has: impl Fn(&str) -> bool) -> Vec<SceneError> {

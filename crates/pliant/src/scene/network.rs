@@ -214,7 +214,8 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
                 .id();
             #[cfg(feature = "render")]
             if let Some(mut materials) = world.get_resource_mut::<Assets<StandardMaterial>>() {
-                // A cooler shade of the same color tells the guest's view from the host's body.
+                // A cooler shade of the same color distinguishes the guest's view from the host's
+                // body.
                 let [r, g, b] = body.color.map(|part| part as f32);
                 let material = materials.add(StandardMaterial {
                     base_color: Color::srgb(0.45 * r + 0.05, 0.45 * g + 0.20, 0.45 * b + 0.45),

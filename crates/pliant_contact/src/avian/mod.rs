@@ -246,7 +246,7 @@ type Colliders<'w, 's> = Query<
     (Without<Obstacle>, Without<ModalBody>),
 >;
 
-/// Takes the pose of every collider at the end of this tick, as far as its velocity tells.
+/// Takes the pose of every collider at the end of this tick, as its velocity predicts it.
 fn move_colliders(
     time: Res<Time>,
     physics: Res<Time<Physics>>,

@@ -320,7 +320,7 @@ mod tests {
         assert!((last - x - 0.01).abs() < 1e-9, "{last}, {x}");
     }
 
-    /// Updates and copies reach the loop on two ways, so for some periods an update tells of other
+    /// Updates and copies reach the loop on two ways, so for some periods an update has other
     /// grabs than the copy has.
     #[test]
     fn a_copy_serves_only_the_grabs_that_it_has() {

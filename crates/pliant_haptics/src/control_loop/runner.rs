@@ -428,7 +428,7 @@ impl<D: HapticDevice> Inner<D> {
         }
     }
 
-    /// Does what the app has told, as long as there is room for what comes back to it.
+    /// Obeys the app's commands, as long as there is room for what comes back to it.
     fn obey_all(&mut self) {
         while !self.trash.is_full()
             && let Ok(command) = self.commands.pop()

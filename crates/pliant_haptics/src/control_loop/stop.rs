@@ -32,13 +32,13 @@ impl StopSwitch {
         if !has_room {
             return false;
         }
-        // Released first: a loop that is told before would find the switch pressed, and latch
-        // again.
+        // Released first: a loop that received the command before would find the switch pressed,
+        // and latch again.
         self.0.store(false, Ordering::Release);
         notify()
     }
 
-    /// Lets the loop do what it was told, and then latches a pressed switch, so that a press takes
+    /// Lets the loop obey its commands, and then latches a pressed switch, so that a press takes
     /// precedence over a reset that is still in the queue.
     pub(crate) fn obey<T>(&self, by: &mut T, commands: impl FnOnce(&mut T), latch: impl FnOnce(&mut T)) {
         commands(by);

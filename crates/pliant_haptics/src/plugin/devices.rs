@@ -50,8 +50,8 @@ pub(crate) struct Entry {
     pub(crate) status: DeviceStatus,
     pub(crate) writer: ModelWriter,
     pub(crate) map: Option<ToolMap>,
-    /// Time of the first tick of the loop that was seen after it was told where its workspace lies,
-    /// or to where it has jumped, s.
+    /// Time of the first tick of the loop that was seen after it received the pose of its
+    /// workspace, or to where it has jumped, s.
     pub(crate) placed: Option<f64>,
     /// Time of the loop's tick whose tool position the simulation has, s.
     pub(crate) seen: f64,
@@ -63,7 +63,7 @@ pub(crate) struct Entry {
     stop: StopSwitch,
 }
 
-/// Time after which a loop that was told where its workspace lies reports tools that are there, s.
+/// Time after which a loop that received the pose of its workspace reports tools that are there, s.
 const PLACED_AFTER: f64 = 0.02;
 
 impl Entry {

@@ -29,7 +29,7 @@ const NEAR: u64 = 60;
 enum Packet {
     Datagram(Vec<u8>),
     Message(Vec<u8>),
-    /// The transport tells the other side that the connection is closed.
+    /// The transport notifies the other side that the connection is closed.
     Close,
 }
 

@@ -236,7 +236,7 @@ fn squeezed(elasticity: Elasticity, rate: f64) -> Result<CaseOutcome, LabError> 
     ]))
 }
 
-/// What an obstacle tells, which no obstacle can be.
+/// Results of an obstacle that no real obstacle can give.
 #[derive(Debug, Clone, Copy)]
 enum Nonsense {
     Distance(f64),

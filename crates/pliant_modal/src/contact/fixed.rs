@@ -111,7 +111,7 @@ impl ObstacleShape for FixedObstacle {
 mod tests {
     use super::*;
 
-    /// What is told of an obstacle has its distances.
+    /// The description of an obstacle has its distances.
     #[test]
     fn an_obstacle_that_is_told_is_the_same_obstacle() {
         let turned = [0.1, 0.3, -0.2, (1.0f64 - 0.14).sqrt()];

@@ -25,7 +25,7 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
     /// Velocity of the obstacle's material at a point (m, world axes) over the step, m/s. Default:
     /// zero.
     ///
-    /// An obstacle that moves is told at its pose at the end of the step.
+    /// An obstacle that moves is given at its pose at the end of the step.
     fn velocity(&self, point: &Vector3<f64>) -> Vector3<f64> {
         let _ = point;
         Vector3::zeros()
@@ -48,7 +48,7 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
     /// Key of the [`Rigid`](crate::Rigid) to which the obstacle belongs, and which contacts push.
     /// Default: `None`, for an obstacle that moves as it does whatever touches it.
     ///
-    /// An obstacle of a rigid body is told at the pose that it has at the end of the step without
+    /// An obstacle of a rigid body is given at the pose that it has at the end of the step without
     /// forces: the center of mass has gone by `h` times its velocity.
     fn rigid(&self) -> Option<[u64; 2]> {
         None
@@ -213,7 +213,7 @@ impl ObstacleShape for Cuboid {
     }
 }
 
-/// An obstacle that is told in its own axes, with a pose and a motion.
+/// An obstacle that is described in its own axes, with a pose and a motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moving<O> {
     /// The obstacle in its own axes.

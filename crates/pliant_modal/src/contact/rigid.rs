@@ -6,7 +6,7 @@ use super::{ObstacleShape, SurfacePoint};
 
 /// A rigid body of another engine in one step. Obstacles that belong to it name it by its key
 /// ([`ObstacleShape::rigid`]), and are pushed: within the step the body responds to the forces of
-/// the contacts, and the step tells their sum.
+/// the contacts, and the step returns their sum.
 ///
 /// The other engine does the step of the rigid body. It must apply the force and the torque, and
 /// should let [`Rigid::weight`] of their displacement happen in the step, as of that of

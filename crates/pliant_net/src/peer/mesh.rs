@@ -185,7 +185,7 @@ impl NetPeer {
 
     /// The peers that are in the session with this one, and where they are reached.
     pub(super) fn reachable(&self) -> Vec<(UserId, String)> {
-        // Who answers at an address that was told of is nobody before its hello.
+        // A peer at an introduced address counts only from its hello on.
         let here = self.others.iter().filter(|(peer, _)| self.is_in(**peer));
         here.filter_map(|(_, other)| Some((other.number?, other.invite.as_ref()?.to_string()))).collect()
     }
@@ -356,7 +356,7 @@ impl NetPeer {
                             }
                         }
                     }
-                    // Whoever comes back is then somebody new, of whom all are told: another peer
+                    // Whoever comes back counts as new, and the list is sent again: another peer
                     // may have given up looking.
                     self.introduce();
                 }

@@ -11,8 +11,8 @@ use crate::transport::{Access, Grant, Invite, Token, has_called};
 const MAX_TOKENS: usize = 4096;
 
 impl NetPeer {
-    /// Returns the invite to this peer that the peer at a connection is told: where tokens are
-    /// asked for, with that peer's own token.
+    /// Returns the invite to this peer for the peer at a connection: where tokens are required,
+    /// with that peer's own token.
     pub(super) fn invite_for(&mut self, peer: PeerId) -> Invite {
         let invite = Invite { token: None, ..self.carrier.invite() };
         let (Access::Tokens(_), Some(other)) = (&self.access, self.others.get(&peer)) else { return invite };

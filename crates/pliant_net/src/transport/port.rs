@@ -64,7 +64,7 @@ const DATAGRAM_HEADER: usize = 2;
 /// of the peers, the cap on the rate ([`Limits::rate`]) with its room for datagrams beside long
 /// messages, and reasons that arrive before the end. Nothing here knows what the path carries: the
 /// cap is the only bound, where QUIC also stops while nothing arrives at all. Losses of packets are
-/// not counted, and a queue on the path is only seen where the netcode tells the round trip
+/// not counted, and a queue on the path is only seen where the netcode reports the round trip
 /// ([`set_round_trip`](Self::set_round_trip)).
 ///
 /// ```

@@ -174,7 +174,7 @@ impl Watched {
                     let own = hands.hands.iter().filter(|hand| hand.body == *id);
                     let new = own.map(|hand| RemoteHand {
                         user: hand.key.user,
-                        // Watchers are not told where on the surface a hand is.
+                        // Watchers do not receive where on the surface a hand is.
                         vertex: 0,
                         target: DVec3::from(hand.target),
                         reaction: DVec3::from(hand.reaction),

@@ -151,7 +151,7 @@ pub(crate) struct HostWatch {
     shared: Arc<Shared>,
     bodies: BTreeMap<BodyId, PublishedBody>,
     hands: Vec<WatchHand>,
-    /// Bodies that the thread has not been told to be gone.
+    /// Removed bodies that the thread has no message about yet.
     gone: Vec<(BodyId, Option<ModelHash>)>,
     catalog_sent: bool,
     stats: PublishStats,
@@ -449,7 +449,7 @@ async fn carry(
             }
         }
     }
-    // The session is over: everybody is told, as far as the relay is there.
+    // The session is over: all watchers get its end, if the relay is there.
     bodies.into_values().for_each(Line::finish);
     hands.finish();
     catalog.finish();

@@ -133,7 +133,7 @@ impl Relay {
         without_token(self.url.as_str())
     }
 
-    /// Keeps a client connected until `client` returns false, and tells `connected` of each change.
+    /// Keeps a client connected until `client` returns false, and calls `connected` at each change.
     pub(super) async fn keep(&self, client: moq_net::Client, connected: impl Fn(bool)) {
         let mut pause = PAUSES[0];
         loop {

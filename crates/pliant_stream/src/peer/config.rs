@@ -82,7 +82,7 @@ pub enum PeerEvent {
     /// Another peer is connected with peers that this one does not have in its session. Of two
     /// that are introduced to each other, the one with the higher number should connect.
     Introduced {
-        /// The connection that told of them.
+        /// The connection that introduced them.
         peer: PeerId,
         /// User numbers and addresses.
         others: Vec<(UserId, String)>,

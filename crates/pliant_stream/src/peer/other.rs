@@ -57,7 +57,7 @@ impl PeerBudgets {
             // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
             // each tick, one with one hand may be 96 ticks late, and one with ten 17.
             late: Budget::new(192.0 / step, 256.0),
-            // Each set is told twice, and a peer has no more than one a second made.
+            // Each set is announced twice, and a peer has no more than one a second made.
             shapes: Budget::new(3.0, 24.0),
         }
     }
@@ -93,7 +93,7 @@ pub(super) struct RemotePeer {
     pub(super) announced_at: Option<Duration>,
     /// User number of the peer, after its hello.
     pub(super) user: Option<UserId>,
-    /// User number that the peer must have; `None` when its hello tells it.
+    /// User number that the peer must have; `None` when its hello has it.
     pub(super) expected: Option<UserId>,
     /// A hello was sent to the peer.
     pub(super) greeted: bool,
@@ -105,7 +105,7 @@ pub(super) struct RemotePeer {
     pub(super) ahead: Option<f64>,
     /// The same mean as the other peer reports it, ticks.
     pub(super) theirs: Option<f64>,
-    /// The newest tick that the other peer has told of.
+    /// The newest tick that the other peer has sent.
     pub(super) newest: Tick,
     pub(super) requested: BTreeMap<Tick, Duration>,
     /// Number of consecutive checks that disagreed, per body.

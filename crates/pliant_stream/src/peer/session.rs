@@ -52,7 +52,7 @@ const STEPS: u64 = 8;
 pub struct PeerSession {
     config: PeerSessionConfig,
     others: BTreeMap<PeerId, RemotePeer>,
-    /// What peers are told of where this one is reached, if not the address of the settings.
+    /// The addresses at which peers reach this one, if not the address of the settings.
     addresses: BTreeMap<PeerId, String>,
     /// Budgets of the users that are away.
     away: AwayBudgets<PeerBudgets>,

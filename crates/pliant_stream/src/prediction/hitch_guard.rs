@@ -1,10 +1,10 @@
-//! Bounds what a hand is told of while its reaction cannot be known well: during a hitch of the
-//! host, the network or this guest, and for a second after it.
+//! Bounds the displayed force of a hand while its reaction cannot be known well: during a hitch of
+//! the host, the network or this guest, and for a second after it.
 //!
 //! The predicted copy follows the hand's own targets. When time has passed unseen, the hand jumps
 //! within a tick, and the copy answers with a force that the body never gives, because the host
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
-//! measure: after a hitch, no hand is told of more than a fifth beyond the largest of the last
+//! measure: after a hitch, no hand is displayed more than a fifth beyond the largest of the last
 //! second, until the host has the hand where this guest sent it. The same holds for a second after
 //! another's hand has come or gone, after a jump of the hand itself, and after an event that has
 //! changed what the copy predicts by more than a twentieth of that measure.
@@ -41,7 +41,7 @@ pub(crate) struct HitchGuard {
     given: VecDeque<(Tick, f64)>,
     called: Option<Duration>,
     bounded_until: Duration,
-    /// Share of the reaction that is told, 0 to 1.
+    /// Share of the reaction that is displayed, 0 to 1.
     share: f64,
     hitch: Duration,
     /// Ticks in a second.
@@ -122,7 +122,7 @@ impl HitchGuard {
         self.given.iter().map(|(_, given)| *given).fold(0.0, f64::max)
     }
 
-    /// Returns what a hand is told of a reaction, N.
+    /// Returns the reaction that is displayed to a hand, N.
     pub(crate) fn bound(&self, reaction: [f64; 3]) -> [f64; 3] {
         let reaction = Vector3::from(reaction) * self.share;
         let bounded = self.called.is_some_and(|now| now < self.bounded_until);

@@ -249,7 +249,7 @@ impl PredictedHand {
         self.astray
     }
 
-    /// Largest change of a reaction of the guest's own hands by what the last frames told, N.
+    /// Largest change of a reaction of the guest's own hands by the last frames, N.
     pub(crate) fn surprise(&self) -> f64 {
         self.surprise
     }

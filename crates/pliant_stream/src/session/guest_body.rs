@@ -192,7 +192,7 @@ impl StreamedBody {
         Some((predicted.held_shapes()?, predicted.columns()))
     }
 
-    /// The reaction that a hand of the guest's own is to be told of, world, N: that of
+    /// The reaction that is displayed to a hand of the guest's own, world, N: that of
     /// [`StreamedBody::predicted_hand`] if there is one.
     ///
     /// After a hitch of the host, the network or this guest, it exceeds what the host has sent in

@@ -45,7 +45,7 @@ impl HostSession {
         // A snapshot is due for guests that wait for the state and have the model. A guest that is
         // still downloading the model waits, without cost to the others.
         let is_due = |p: &GuestPeer| p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == hash);
-        // Messages are reliable, so who has been told that the body rests need not be told again.
+        // Messages are reliable, so the message that the body rests is sent to each guest once.
         if stays && !self.peers.values().any(is_due) {
             return Ok(());
         }

@@ -209,7 +209,7 @@ impl Remote {
     }
 
     /// Says goodbye to a connection of which a message has come and that this end does not have:
-    /// the port is a new one, and its netcode has not told the other end. Once is enough.
+    /// the port is a new one, and its netcode has not notified the other end. Once is enough.
     pub(super) fn deny(&mut self, number: u16) {
         let is_closing = self.closing.iter().chain(&self.open).any(|own| own.number == number);
         if !is_closing && self.denied.replace(number) != Some(number) {
@@ -226,7 +226,7 @@ impl Remote {
     /// Ends the open connection, if it is one of a session's that are meant.
     pub(super) fn end(&mut self, meant: impl Fn(PeerId) -> bool, of: &Arc<Connections>) {
         let own = |open: &mut Connection| Arc::ptr_eq(&open.connections, of) && meant(open.id);
-        // One that the other end has not been told of is forgotten.
+        // One that has not been announced to the other end is forgotten.
         if let Some(open) = self.open.take_if(own).filter(|open| open.admitted || open.hello.is_none()) {
             open.peer.outbox.close(DisconnectReason::Left);
             self.closing.push_back(open);

@@ -103,7 +103,7 @@ impl PortState {
         let nobody = Arc::new(Connections::new(connections.limits.clone()));
         for remote in self.remotes.values_mut() {
             remote.end(|id| id == peer, connections);
-            // Of its end nobody is told.
+            // Its end is no event.
             let own = |open: &&mut Connection| open.id == peer && Arc::ptr_eq(&open.connections, connections);
             remote.closing.iter_mut().filter(own).for_each(|open| open.connections = Arc::clone(&nobody));
         }

@@ -23,7 +23,7 @@ impl PeerSession {
     /// Adds a connection that this side has opened, and sends a hello.
     ///
     /// `user` is the number that the other peer was given. A peer with another number is not
-    /// accepted, because the lowest number is trusted. `None`: its hello tells the number.
+    /// accepted, because the lowest number is trusted. `None`: its hello has the number.
     ///
     /// # Errors
     /// Returns [`StreamError::Full`] beyond 64 peers and [`StreamError::Config`] for the number 0,
@@ -106,7 +106,7 @@ impl PeerSession {
         }
     }
 
-    /// Gives a peer the number that it has requested ([`PeerEvent::JoinRequest`]), and tells it the
+    /// Gives a peer the number that it has requested ([`PeerEvent::JoinRequest`]), and sends it the
     /// numbers and addresses of the others.
     ///
     /// # Errors

@@ -1,7 +1,7 @@
 //! The own shapes of held patches: which of them count from which tick, who says so, and what is to
 //! be made.
 //!
-//! The peer with the lowest number decides. It tells what it begins to make, so that the others
+//! The peer with the lowest number decides. It sends what it begins to make, so that the others
 //! make it at the same time, and when it has made it, from which tick it counts.
 
 use std::sync::Arc;

@@ -163,7 +163,7 @@ pub(in super::super) fn fill_rows(rigids: &[Rigid], work: &mut Touching, h: f64)
     }
 }
 
-/// Takes the places where rigid bodies touch each other from the points, and tells their forces.
+/// Takes the places where rigid bodies touch each other from the points, and writes their forces.
 pub(in super::super) fn take_supports<P>(group: &mut Group<'_, P>, work: &mut Touching) {
     work.points.retain(|point| {
         let Some(at) = point.support else { return true };
