@@ -49,6 +49,7 @@ fn exchange(
         sinks: stats.sinks,
         ticks: stats.collected,
         dropped: stats.dropped,
+        removed: stats.removed,
         shapes_hz: settings.shapes_hz,
         modes_hz: settings.modes_hz,
         stress: settings.color == RerunColor::Stress,
@@ -76,13 +77,13 @@ mod tests {
         let odd = RerunRecording { shapes_hz: f64::INFINITY, modes_hz: 1.0 / 3.0, ..default() };
         let mut app = app(|app| {
             app.insert_resource(odd).init_resource::<Panel>();
-            app.insert_resource(RerunStats { sinks: 1, collected: 7, ..default() });
+            app.insert_resource(RerunStats { sinks: 1, collected: 7, removed: 2, ..default() });
         });
         let now = |app: &App| *app.world().resource::<RerunRecording>();
         app.update();
         assert_eq!(now(&app), odd, "looked at, and left as it is");
         let seen = app.world().resource::<PanelRecording>();
-        assert_eq!((seen.sinks, seen.ticks, seen.on, seen.stress), (1, 7, true, false));
+        assert_eq!((seen.sinks, seen.ticks, seen.removed, seen.on, seen.stress), (1, 7, 2, true, false));
 
         let mut knobs = app.world_mut().resource_mut::<PanelRecording>();
         (knobs.on, knobs.stress, knobs.modes_hz) = (false, true, 2.0);

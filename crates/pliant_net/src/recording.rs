@@ -15,9 +15,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use bevy::log::{error, warn};
+use bevy::log::{error, info, warn};
 use bytes::Bytes;
 use pliant_modal::{FileError, ModalModel, ModelHash};
+use pliant_path::RecordingFolder;
 use pliant_stream::{DisconnectReason, MAX_MESSAGE};
 use thiserror::Error;
 
@@ -69,12 +70,15 @@ struct RecordingLimits {
     bytes: u64,
     /// Most bytes of all different models together.
     models: u64,
+    /// Most bytes of all recordings in a folder together, as files.
+    folder: u64,
 }
 
 impl RecordingLimits {
-    const WRITTEN: Self = Self { bytes: MAX_BYTES, models: MAX_MODELS };
+    const WRITTEN: Self = Self { bytes: MAX_BYTES, models: MAX_MODELS, folder: u64::MAX };
     /// Every recording within [`Self::WRITTEN`] can be read.
-    const READ: Self = Self { bytes: MAX_BYTES + HEAD + LONGEST_MODEL as u64, models: MAX_MODELS };
+    const READ: Self =
+        Self { bytes: MAX_BYTES + HEAD + LONGEST_MODEL as u64, models: MAX_MODELS, folder: u64::MAX };
 }
 
 /// A piece of data that the guest received.
@@ -187,17 +191,31 @@ struct RecordWriter {
     models: HashSet<ModelHash>,
     model_bytes: u64,
     limits: RecordingLimits,
+    /// The folder of the recording, if one was named.
+    folder: Option<RecordingFolder>,
     flushed: Duration,
 }
 
 impl SessionRecorder {
-    pub(crate) fn create(path: &Path) -> Result<Self, RecordingError> {
-        Self::limited(path, RecordingLimits::WRITTEN)
+    /// Records to a file, or to a new file of a folder, whose recordings have at most `budget`
+    /// bytes together.
+    pub(crate) fn create(path: &Path, budget: u64) -> Result<Self, RecordingError> {
+        Self::limited(path, RecordingLimits { folder: budget, ..RecordingLimits::WRITTEN })
     }
 
     fn limited(path: &Path, limits: RecordingLimits) -> Result<Self, RecordingError> {
         let fail = |source| RecordingError::File { path: path.to_owned(), source };
-        let mut file = File::create(path).map_err(fail)?;
+        let is_folder = RecordingFolder::is_named_by(path);
+        let folder = is_folder.then(|| RecordingFolder {
+            path: path.to_owned(),
+            extension: "pliant",
+            magic: MAGIC,
+            budget: limits.folder,
+        });
+        let (path, mut file) = match &folder {
+            Some(folder) => folder.create().map_err(fail)?,
+            None => (path.to_owned(), File::create(path).map_err(fail)?),
+        };
         file.write_all(MAGIC).map_err(fail)?;
         let encoder = zstd::stream::write::Encoder::new(file, LEVEL).map_err(fail)?;
         let waiting = Arc::new(AtomicUsize::new(0));
@@ -210,9 +228,10 @@ impl SessionRecorder {
             models: HashSet::new(),
             model_bytes: 0,
             limits,
+            folder,
             flushed: Duration::ZERO,
         };
-        let named = path.to_owned();
+        let named = path.clone();
         let write = move || {
             if let Err(error) = writer.write_all(&from) {
                 // A failed recording must not end the session.
@@ -221,7 +240,6 @@ impl SessionRecorder {
             drop(end);
         };
         let thread = std::thread::Builder::new().name("pliant-record".into()).spawn(write).map_err(fail)?;
-        let path = path.to_owned();
         Ok(Self {
             to: Some(to),
             waiting,
@@ -273,18 +291,39 @@ impl RecordWriter {
                     SessionRecord::Model(bytes.into())
                 }
             };
-            if let Err(error) = self.room(&record) {
+            let mut room = self.room(&record);
+            if room.is_ok() {
+                self.written += write(&mut self.encoder, at, &record)?;
+                if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
+                    self.flushed = at;
+                    self.encoder.flush()?;
+                    room = self.room_in_folder();
+                }
+            }
+            if let Err(error) = room {
                 // What was recorded so far stays a whole recording.
                 self.encoder.do_finish()?;
                 return Err(error);
             }
-            self.written += write(&mut self.encoder, at, &record)?;
-            if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
-                self.flushed = at;
-                self.encoder.flush()?;
-            }
         }
-        self.encoder.do_finish()
+        self.encoder.do_finish()?;
+        self.room_in_folder()
+    }
+
+    /// Removes the oldest recordings of the folder if all have too many bytes.
+    ///
+    /// # Errors
+    /// An error if none can be removed, and errors of the operating system.
+    fn room_in_folder(&self) -> io::Result<()> {
+        let Some(folder) = &self.folder else { return Ok(()) };
+        let (room, budget) = (folder.make_room()?, folder.budget);
+        for old in &room.removed {
+            info!("{} was removed: the recordings had more than {budget} bytes together", old.display());
+        }
+        if room.is_enough {
+            return Ok(());
+        }
+        Err(io::Error::other(format!("recordings of {} bytes are left where {budget} may be", room.bytes)))
     }
 
     /// Checks that a reader will accept the recording with one more record.

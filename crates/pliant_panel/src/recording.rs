@@ -15,6 +15,8 @@ pub struct RecordingView {
     pub ticks: u64,
     /// Number of ticks dropped because a sink's queue was full.
     pub dropped: u64,
+    /// Number of older recordings that were removed from the folder of this one to make room.
+    pub removed: u64,
     /// Drawings of shapes per second, Hz. A knob.
     pub shapes_hz: f64,
     /// Drawings of mode energies and spectra per second, Hz. A knob.
@@ -26,7 +28,11 @@ pub struct RecordingView {
 /// Shows the recording.
 pub fn show(ui: &mut Ui, recording: &mut RecordingView) {
     if recording.sinks == 0 {
-        ui.weak("Nothing records: no file was named, and no viewer answers.");
+        ui.weak(if recording.ticks == 0 {
+            "Nothing records: no file was named, and no viewer answers.".into()
+        } else {
+            format!("Nothing records any more after {} ticks: the log says why.", recording.ticks)
+        });
         return;
     }
     ui.horizontal(|ui| {
@@ -34,6 +40,10 @@ pub fn show(ui: &mut Ui, recording: &mut RecordingView) {
         let sinks = if recording.sinks == 1 { "1 sink".into() } else { format!("{} sinks", recording.sinks) };
         ui.label(format!("{} ticks to {sinks}, {} dropped", recording.ticks, recording.dropped));
     });
+    if recording.removed > 0 {
+        let recordings = if recording.removed == 1 { "recording was" } else { "recordings were" };
+        ui.label(format!("{} older {recordings} removed to make room", recording.removed));
+    }
     let every = if recording.shapes_hz.is_finite() {
         format!("now {} a second", short(recording.shapes_hz))
     } else {

@@ -303,6 +303,7 @@ fn a_recording_is_switched_off_and_thinned() {
         sinks: 1,
         ticks: 40,
         dropped: 0,
+        removed: 3,
         shapes_hz: 20.0,
         modes_hz: 4.0,
         stress: false,
@@ -319,6 +320,11 @@ fn a_recording_is_switched_off_and_thinned() {
     harness.get_by_label("color by stress").click();
     harness.run();
     assert!(harness.state().stress);
+    // What became of earlier recordings, and of this one, is told.
+    assert!(harness.query_by_label("3 older recordings were removed to make room").is_some());
+    harness.state_mut().sinks = 0;
+    harness.run();
+    assert!(harness.query_by_label_contains("Nothing records any more").is_some());
 }
 
 #[test]

@@ -1,8 +1,13 @@
-//! Paths in files from someone else.
+//! Paths in files from someone else, and folders of recordings with a budget.
 //!
-//! A scene and a document of a mesh name files by the same rule. It is a crate of its own, without
+//! A scene and a document of a mesh name files by the same rule, and the recordings of sessions and
+//! of the viewer make room in their folders by the same rule. It is a crate of its own, without
 //! dependencies, because a game that makes no bodies itself leaves `pliant_mesh` out and still
 //! reads scenes.
+
+mod recordings;
+
+pub use recordings::{RecordingFolder, Room};
 
 /// Longest path, bytes.
 const LONGEST: usize = 1024;

@@ -296,6 +296,7 @@ pub(crate) fn collect(
     }
     stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();
+    stats.removed = collector.workers.iter().map(Worker::removed).sum();
 }
 
 fn follow_bodies(collector: &mut Collector, frame: &mut RecordedFrame, bodies: &Bodies, wanted: WantedData) {

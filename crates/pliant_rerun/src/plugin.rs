@@ -21,6 +21,7 @@ pub struct RerunPlugin {
     application: String,
     file: Option<PathBuf>,
     file_limit: u64,
+    folder_budget: u64,
     viewer: Option<u16>,
     spawn: bool,
     rates: RerunRecording,
@@ -36,7 +37,17 @@ impl RerunPlugin {
     /// Default size at which the recording in a file ends, bytes: 16 GiB.
     pub const FILE_LIMIT: u64 = 16 << 30;
 
+    /// Default of the bytes that all recordings in a folder may have together: 32 GiB.
+    pub const FOLDER_BUDGET: u64 = 32 << 30;
+
     /// Records to the file `path` (`.rrd`) and overwrites it.
+    ///
+    /// If `path` is an existing folder or ends with a separator, each run records to a new file in
+    /// that folder, which is created if needed. When its recordings have more bytes together than
+    /// [`with_folder_budget`](Self::with_folder_budget), the oldest finished ones are removed
+    /// ([`RerunStats::removed`]), and if there are none, the recording ends. Only files that this
+    /// plugin has written are removed, told by their names and first bytes: a recording that is
+    /// renamed stays.
     pub fn file(path: impl Into<PathBuf>) -> Self {
         Self { file: Some(path.into()), ..Self::none() }
     }
@@ -58,6 +69,7 @@ impl RerunPlugin {
             application: "pliant".into(),
             file: None,
             file_limit: Self::FILE_LIMIT,
+            folder_budget: Self::FOLDER_BUDGET,
             viewer: None,
             spawn: true,
             rates: RerunRecording::default(),
@@ -103,6 +115,14 @@ impl RerunPlugin {
     #[must_use]
     pub fn with_file_limit(mut self, bytes: u64) -> Self {
         self.file_limit = bytes;
+        self
+    }
+
+    /// Sets the bytes that all recordings in a folder may have together, if [`file`](Self::file)
+    /// names a folder. Default: [`FOLDER_BUDGET`](Self::FOLDER_BUDGET).
+    #[must_use]
+    pub fn with_folder_budget(mut self, bytes: u64) -> Self {
+        self.folder_budget = bytes;
         self
     }
 
@@ -240,13 +260,16 @@ pub struct RerunStats {
     pub dropped: u64,
     /// Number of connected sinks.
     pub sinks: usize,
+    /// Number of older recordings that were removed from the folder of this one, because all
+    /// together had more bytes than [`RerunPlugin::with_folder_budget`].
+    pub removed: u64,
 }
 
 /// The reason why a recording could not be started.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RerunError {
-    /// The file cannot be written.
+    /// The file cannot be written, or its folder cannot be created.
     #[error("cannot record to {path}: {source}")]
     File {
         /// The requested path.
@@ -269,7 +292,11 @@ impl Plugin for RerunPlugin {
     fn build(&self, app: &mut App) {
         app.init_resource::<RerunScalars>().init_resource::<RerunStats>().register_type::<RerunStyle>();
         let targets = [
-            self.file.clone().map(|path| Target::File { path, limit: self.file_limit }),
+            self.file.clone().map(|path| Target::File {
+                path,
+                limit: self.file_limit,
+                budget: self.folder_budget,
+            }),
             self.viewer.map(|port| Target::Viewer { port, spawn: self.spawn }),
         ];
         let plots = Plots::new(self.titles.iter().cloned());

@@ -318,7 +318,7 @@ pub(crate) fn scratch(name: &str) -> PathBuf {
 }
 
 /// Whether the file ends with the footer that the encoder of a recording writes last.
-fn is_whole(path: &Path) -> bool {
+pub(crate) fn is_whole(path: &Path) -> bool {
     let bytes = std::fs::read(path).unwrap();
     bytes.starts_with(b"RRF2")
         && bytes.len() > 1000

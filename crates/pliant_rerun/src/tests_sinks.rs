@@ -26,7 +26,7 @@ use crate::{
     collect::Collector,
     log_lines::Lines,
     queue::{FrameReceiver, queue},
-    tests::{app, numbers, recorder, rows, scratch, until, update_to},
+    tests::{app, is_whole, numbers, recorder, rows, scratch, until, update_to},
     worker::{Message, Worker},
 };
 
@@ -234,4 +234,43 @@ fn what_the_app_logs_is_a_line_but_for_what_the_recorder_says_of_itself() {
     let lines: Vec<(bool, String)> = taken.try_iter().map(|line| (line.warning, line.text)).collect();
     let expected = [(false, "game: half time points=3"), (true, "game: low on time"), (false, "game: flood")];
     assert_eq!(lines, expected.map(|(warning, text)| (warning, text.to_owned())));
+}
+
+#[test]
+fn recordings_of_many_runs_stay_within_the_budget_of_their_folder() {
+    let folder = scratch("folder").with_extension("");
+    std::fs::remove_dir_all(&folder).ok();
+    let files = || {
+        let entries = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap());
+        let mut files: Vec<_> = entries.map(|file| (file.path(), file.metadata().unwrap().len())).collect();
+        files.sort();
+        files
+    };
+    let run = |budget, until_it: &dyn Fn(&RerunStats) -> bool| {
+        let mut app = app(RerunPlugin::file(folder.join("")).with_folder_budget(budget));
+        until("what this run is for", || update_to(&mut app, until_it));
+        *app.world().resource::<RerunStats>()
+    };
+    // Two runs within the budget, each with a file of its own.
+    for _ in 0..2 {
+        assert_eq!(run(1 << 30, &|stats| stats.collected > 80).removed, 0);
+    }
+    let two = files();
+    assert!(two.len() == 2 && two.iter().all(|(_, bytes)| *bytes > 1000), "{two:?}");
+    std::fs::write(folder.join("mine.rrd"), [0; 100_000]).unwrap();
+    // A third run has no room for the first.
+    let stats = run(two[1].1 + 60_000, &|stats| stats.removed > 0 && stats.collected > 80);
+    println!("{two:?}: {} removed", stats.removed);
+    let mut kept: Vec<_> = files().into_iter().map(|(path, _)| path).collect();
+    assert!(kept.contains(&folder.join("mine.rrd")), "files of others stay: {kept:?}");
+    kept.retain(|path| *path != folder.join("mine.rrd"));
+    assert!(!kept.contains(&two[0].0) && kept.len() as u64 <= 3 - stats.removed, "{kept:?}");
+    assert!(kept.iter().any(|path| *path > two[1].0), "its own stays: {kept:?}");
+    // A run that has no room alone ends, and its file is whole.
+    let stats = run(20_000, &|stats| stats.sinks == 0 && stats.collected > 0);
+    assert_eq!(stats.removed, kept.len() as u64);
+    let left = files();
+    assert_eq!(left.len(), 2, "its own and that of another: {left:?}");
+    assert!(is_whole(&left[1].0), "{left:?}");
+    std::fs::remove_dir_all(&folder).unwrap();
 }

@@ -5,11 +5,12 @@
 
 use std::{
     any::Any,
+    fs::File,
     net::{SocketAddr, TcpStream},
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{
         Arc,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
     thread::JoinHandle,
     time::Duration,
@@ -20,6 +21,7 @@ use bevy::{
     platform::time::Instant,
 };
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
+use pliant_path::RecordingFolder;
 use rerun::{
     ApplicationId, RecordingStream, RecordingStreamBuilder, RecordingStreamError, SpawnOptions,
     log::ChunkBatcherConfig,
@@ -45,10 +47,12 @@ const VIEWER_END: Duration = Duration::from_secs(5);
 /// The destination of one worker's recording.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Target {
-    /// A file, and the size at which the recording ends, bytes.
+    /// A file or a folder, the size at which the recording ends, and the size of all recordings in
+    /// the folder together, bytes.
     File {
         path: PathBuf,
         limit: u64,
+        budget: u64,
     },
     Viewer {
         port: u16,
@@ -71,6 +75,9 @@ const WATCH: Duration = Duration::from_secs(1);
 /// Interval of the looks at the size of a file.
 const MEASURE: Duration = Duration::from_millis(500);
 
+/// First bytes of each file that the SDK writes.
+const FILE_MAGIC: &[u8] = b"RRF2";
+
 /// One tick for a worker.
 pub(crate) struct Message {
     pub frame: Arc<RecordedFrame>,
@@ -84,6 +91,49 @@ pub(crate) struct Worker {
     ended: Receiver<()>,
     patience: Duration,
     owed: Option<Owed>,
+    /// Number of older recordings that were removed.
+    removed: Arc<AtomicU64>,
+}
+
+/// The file of a recording, and what bounds it.
+struct RecordedFile {
+    path: PathBuf,
+    limit: u64,
+    /// The folder, if one was named, and the file, which is locked while it is open here.
+    folder: Option<(RecordingFolder, File)>,
+    removed: Arc<AtomicU64>,
+}
+
+impl RecordedFile {
+    fn create(path: &Path, limit: u64, budget: u64, removed: &Arc<AtomicU64>) -> Result<Self, RerunError> {
+        let fail = |source| RerunError::File { path: path.to_owned(), source };
+        let removed = removed.clone();
+        if !RecordingFolder::is_named_by(path) {
+            File::create(path).map_err(fail)?;
+            return Ok(Self { path: path.to_owned(), limit, folder: None, removed });
+        }
+        let folder = RecordingFolder { path: path.to_owned(), extension: "rrd", magic: FILE_MAGIC, budget };
+        let (path, file) = folder.create().map_err(fail)?;
+        Ok(Self { path, limit, folder: Some((folder, file)), removed })
+    }
+
+    /// Returns why the recording must end here, if it must. Removes older ones before that.
+    fn full(&self) -> Option<String> {
+        let Self { path, limit, folder, removed } = self;
+        if std::fs::metadata(path).is_ok_and(|file| file.len() >= *limit) {
+            return Some(format!("it has reached its limit of {limit} bytes"));
+        }
+        let (folder, _) = folder.as_ref()?;
+        // A folder that cannot be read now is asked again.
+        let room = folder.make_room().ok()?;
+        for old in &room.removed {
+            removed.fetch_add(1, Ordering::Relaxed);
+            let budget = folder.budget;
+            info!("{} was removed: the recordings had more than {budget} bytes together", old.display());
+        }
+        let (bytes, budget) = (room.bytes, folder.budget);
+        (!room.is_enough).then(|| format!("recordings of {bytes} bytes are left where {budget} may be"))
+    }
 }
 
 impl Worker {
@@ -103,14 +153,14 @@ impl Worker {
         let builder = RecordingStreamBuilder::new(id);
         let (frames, inbox) = queue(room);
         let (end, ended) = bounded(1);
-        let patience = match target {
-            Target::File { path, .. } => {
-                std::fs::File::create(path)
-                    .map_err(|source| RerunError::File { path: path.clone(), source })?;
-                info!("recording to {}", path.display());
-                FILE_END
+        let removed = Arc::default();
+        let (patience, file) = match target {
+            Target::File { path, limit, budget } => {
+                let file = RecordedFile::create(path, *limit, *budget, &removed)?;
+                info!("recording to {}", file.path.display());
+                (FILE_END, Some(file))
             }
-            Target::Viewer { .. } => VIEWER_END,
+            Target::Viewer { .. } => (VIEWER_END, None),
         };
         let target = target.clone();
         let thread = std::thread::Builder::new()
@@ -119,15 +169,15 @@ impl Worker {
                 // This comes before the stream starts its threads, so that they inherit the
                 // priority.
                 give_way();
-                match target.open(builder) {
-                    Some(stream) => record(&stream, &target, (inbox, &spare), plots),
+                match target.open(builder, file.as_ref()) {
+                    Some(stream) => record(&stream, &target, file.as_ref(), (inbox, &spare), plots),
                     // Dropping the inbox shows the app that the sink is closed.
                     None => drop(inbox),
                 }
                 drop(end);
             })
             .map_err(RerunError::Thread)?;
-        Ok(Self { frames, thread: Some(thread), ended, patience, owed: None })
+        Ok(Self { frames, thread: Some(thread), ended, patience, owed: None, removed })
     }
 
     /// Returns a worker whose frames a test receives.
@@ -135,7 +185,8 @@ impl Worker {
     pub fn held(room: usize) -> (Self, FrameReceiver<Message>) {
         let (frames, inbox) = queue(room);
         let (_, ended) = bounded(1);
-        (Self { frames, thread: None, ended, patience: Duration::ZERO, owed: None }, inbox)
+        let removed = Arc::default();
+        (Self { frames, thread: None, ended, patience: Duration::ZERO, owed: None, removed }, inbox)
     }
 
     /// Whether the thread has ended by itself, so that closing does not wait.
@@ -186,6 +237,11 @@ impl Worker {
     /// Returns the number of frames dropped because the queue was full.
     pub fn dropped(&self) -> u64 {
         self.frames.dropped()
+    }
+
+    /// Returns the number of older recordings that were removed for this one.
+    pub fn removed(&self) -> u64 {
+        self.removed.load(Ordering::Relaxed)
     }
 
     /// Lets the worker log the queued frames and close its recording.
@@ -243,6 +299,7 @@ fn give_way() {
 fn record(
     stream: &RecordingStream,
     target: &Target,
+    file: Option<&RecordedFile>,
     (inbox, spare): (FrameReceiver<Message>, &Sender<RecordedFrame>),
     plots: Plots,
 ) {
@@ -250,7 +307,7 @@ fn record(
     let mut failing = false;
     let (mut sent, mut watched, mut measured) = (Instant::now(), Instant::now(), Instant::now());
     let lost = Arc::new(AtomicBool::new(false));
-    let columns = if matches!(target, Target::File { .. }) { FILE_COLUMNS } else { VIEWER_COLUMNS };
+    let columns = if file.is_some() { FILE_COLUMNS } else { VIEWER_COLUMNS };
     loop {
         let (goes_on, frames) = inbox.wait(PAUSE);
         for Message { frame, owed } in frames {
@@ -280,12 +337,12 @@ fn record(
         if !goes_on {
             break;
         }
-        if let Target::File { path, limit } = target
+        if let Some(file) = file
             && measured.elapsed() >= MEASURE
         {
             measured = Instant::now();
-            if std::fs::metadata(path).is_ok_and(|file| file.len() >= *limit) {
-                warn!("{} has reached its limit of {limit} bytes: the recording ends here", path.display());
+            if let Some(reason) = file.full() {
+                warn!("{}: {reason}, so that the recording ends here", file.path.display());
                 // The app is notified before the SDK closes the file.
                 drop(inbox);
                 recorder.end();
@@ -318,16 +375,12 @@ fn is_lost(sink: &dyn LogSink) -> bool {
 impl Target {
     /// Opens a stream to an existing destination. The SDK's own connection would wait for a viewer
     /// forever, also at its end.
-    fn open(&self, builder: RecordingStreamBuilder) -> Option<RecordingStream> {
-        let (port, spawn) = match self {
-            Self::File { path, .. } => {
-                let stream = builder.save(path);
-                return stream
-                    .inspect_err(|error| error!("cannot record to {}: {error}", path.display()))
-                    .ok();
-            }
-            &Self::Viewer { port, spawn } => (port, spawn),
-        };
+    fn open(&self, builder: RecordingStreamBuilder, file: Option<&RecordedFile>) -> Option<RecordingStream> {
+        if let Some(RecordedFile { path, .. }) = file {
+            let stream = builder.save(path);
+            return stream.inspect_err(|error| error!("cannot record to {}: {error}", path.display())).ok();
+        }
+        let &Self::Viewer { port, spawn } = self else { return None };
         if !listens(port) {
             if !spawn {
                 info!("no rerun viewer on port {port}: going on without one");

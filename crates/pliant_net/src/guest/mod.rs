@@ -69,7 +69,15 @@ pub struct JoinConfig {
     pub models: Vec<Arc<ModalModel>>,
     /// File to which all received data is written, for
     /// [`NetPlugin::replay`](crate::NetPlugin::replay). Default: none.
+    ///
+    /// If this is an existing folder or ends with a separator, each session is written to a new
+    /// file in that folder, which is created if needed. When its recordings have more than
+    /// `record_budget` bytes together, the oldest finished ones are removed, and if there are none,
+    /// the recording ends. Only files that Pliant has written are removed, told by their names and
+    /// first bytes: a recording that is renamed stays.
     pub record: Option<PathBuf>,
+    /// Most bytes of all recordings together, if `record` is a folder. Default: 32 GiB.
+    pub record_budget: u64,
 }
 
 impl Default for JoinConfig {
@@ -85,6 +93,7 @@ impl Default for JoinConfig {
             rejoin: Duration::from_secs(60),
             models: Vec::new(),
             record: None,
+            record_budget: 32 << 30,
         }
     }
 }
@@ -145,7 +154,8 @@ pub struct NetGuest {
 
 impl NetGuest {
     pub(crate) fn join(mut config: JoinConfig, carrier: Box<dyn Carrier>) -> Result<Self, RecordingError> {
-        let recorder = config.record.take().map(|path| SessionRecorder::create(&path)).transpose()?;
+        let (record, budget) = (config.record.take(), config.record_budget);
+        let recorder = record.map(|path| SessionRecorder::create(&path, budget)).transpose()?;
         Ok(Self::new(config, Source::Live { carrier, recorder }))
     }
 

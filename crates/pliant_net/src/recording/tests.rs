@@ -24,7 +24,7 @@ fn records() -> Vec<(Duration, SessionRecord)> {
 }
 
 fn limits(bytes: u64, models: u64) -> RecordingLimits {
-    RecordingLimits { bytes, models }
+    RecordingLimits { bytes, models, folder: u64::MAX }
 }
 
 /// Data of a record by its kind, written without a limit.
@@ -48,6 +48,17 @@ fn packed(name: &str, records: &mut [Raw<'_>]) -> PathBuf {
 fn played(path: &Path) -> Vec<usize> {
     let mut recording = SessionRecording::open(path).unwrap();
     std::iter::from_fn(|| recording.poll(Duration::MAX)).map(|(_, record)| record.len()).collect()
+}
+
+/// Bytes that do not compress, by xorshift (Marsaglia 2003).
+fn noise(state: &mut u64, length: usize) -> Bytes {
+    let next = |_| {
+        *state ^= *state << 13;
+        *state ^= *state >> 7;
+        *state ^= *state << 17;
+        (*state >> 24) as u8
+    };
+    (0..length).map(next).collect()
 }
 
 #[test]
@@ -135,7 +146,7 @@ fn models_are_kept_once_and_up_to_a_bound() {
 #[test]
 fn a_message_that_no_session_takes_ends_the_recording_and_leaves_it_whole() {
     let path = file("long");
-    let mut recorder = SessionRecorder::create(&path).unwrap();
+    let mut recorder = SessionRecorder::create(&path, u64::MAX).unwrap();
     for length in [9, MAX_MESSAGE, MAX_MESSAGE + 1, 9] {
         recorder.put(Duration::ZERO, &SessionRecord::Message(vec![7; length].into()));
     }
@@ -160,6 +171,51 @@ fn a_recording_ends_at_its_limit_and_is_whole() {
     std::fs::remove_file(&path).unwrap();
 }
 
+/// A game that records every session into one folder.
+#[test]
+fn recordings_of_many_sessions_stay_within_the_budget_of_their_folder() {
+    let folder = file("folder");
+    std::fs::remove_dir_all(&folder).ok();
+    let (budget, sessions) = (100_000, 20);
+    let with_separator = folder.join("");
+    let mut state = 1;
+    let mut session = |to: &Path, budget, messages: u64| {
+        let mut recorder = SessionRecorder::create(to, budget).unwrap();
+        for n in 0..messages {
+            let message = noise(&mut state, 10_000);
+            recorder.put(Duration::from_secs(2 * n), &SessionRecord::Message(message));
+        }
+        let path = recorder.path.clone();
+        drop(recorder);
+        path
+    };
+    let bytes =
+        || -> u64 { std::fs::read_dir(&folder).unwrap().map(|e| e.unwrap().metadata().unwrap().len()).sum() };
+    let mut most = 0;
+    // The first names a folder that is not there yet.
+    let mut names: Vec<PathBuf> = (0..sessions)
+        .map(|n| {
+            let path = session(if n == 0 { &with_separator } else { &folder }, budget, 3);
+            most = most.max(bytes());
+            path
+        })
+        .collect();
+    names.dedup();
+    assert_eq!(names.len(), sessions, "each session has a file of its own");
+    println!("{sessions} sessions of 30 kB each: at most {most} bytes in a folder of {budget}");
+    assert!((60_000..=budget).contains(&most), "{most} bytes");
+    let left: Vec<&PathBuf> = names.iter().filter(|path| path.exists()).collect();
+    assert_eq!(left, names[sessions - 3..].iter().collect::<Vec<_>>(), "the newest stay");
+    assert!(left.iter().all(|path| played(path) == [10_000; 3]), "and are whole");
+
+    // One that does not fit alone removes the others and ends, and is whole up to there.
+    let long = session(&folder, budget, 30);
+    let played = played(&long);
+    assert!((8..=11).contains(&played.len()), "{played:?}");
+    assert!(bytes() <= budget + 20_000, "{} bytes", bytes());
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
 /// A pipe that nobody reads is a disk that stands still.
 #[cfg(unix)]
 #[test]
@@ -168,19 +224,13 @@ fn a_disk_that_stands_still_holds_up_no_frame_and_no_end() {
     let made = std::process::Command::new("mkfifo").arg(&path).status();
     assert!(made.is_ok_and(|status| status.success()), "mkfifo");
     let nobody = File::options().read(true).write(true).open(&path).unwrap();
-    let mut recorder = SessionRecorder::create(&path).unwrap();
+    let mut recorder = SessionRecorder::create(&path, u64::MAX).unwrap();
     recorder.patience = Duration::from_millis(100);
     let began = std::time::Instant::now();
     let (mut state, mut most) = (1_u64, 0);
     for n in 0..20_000 {
-        // Bytes that do not compress, by xorshift (Marsaglia 2003).
-        let noise = (0..1000).map(|_| {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
-            (state >> 24) as u8
-        });
-        recorder.put(Duration::from_millis(n), &SessionRecord::Datagram(noise.collect()));
+        let datagram = noise(&mut state, 1000);
+        recorder.put(Duration::from_millis(n), &SessionRecord::Datagram(datagram));
         most = most.max(recorder.waiting.load(Ordering::Relaxed));
     }
     assert!(recorder.to.is_none(), "the recording goes on");
@@ -196,7 +246,7 @@ fn a_disk_that_stands_still_holds_up_no_frame_and_no_end() {
 fn what_was_recorded_is_played_at_its_time_also_from_a_file_that_was_cut() {
     let path = file("whole");
     let records = records();
-    let mut recorder = SessionRecorder::create(&path).unwrap();
+    let mut recorder = SessionRecorder::create(&path, u64::MAX).unwrap();
     records.iter().for_each(|(at, record)| recorder.put(*at, record));
     drop(recorder);
     let mut recording = SessionRecording::open(&path).unwrap();
