@@ -10,7 +10,8 @@ use std::time::Duration;
 use pliant_haptics::Replay;
 use pliant_mesh::io;
 use pliant_modal::{
-    BakeInfo, Damping, Element, FixedObstacle, FixedShape, GrabConfig, ModalModel, ModelParts, SurfaceMesh,
+    BakeInfo, Body, BodyConfig, Damping, Element, FixedObstacle, FixedShape, GrabConfig, ModalModel,
+    ModelParts, Plane, SavedBody, SurfaceMesh,
 };
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
@@ -22,7 +23,7 @@ use pliant_stream::{
 };
 
 /// All targets by name.
-pub const TARGETS: [(&str, fn(&[u8])); 11] = [
+pub const TARGETS: [(&str, fn(&[u8])); 12] = [
     ("datagrams", datagrams),
     ("messages", messages),
     ("peers", peers),
@@ -30,6 +31,7 @@ pub const TARGETS: [(&str, fn(&[u8])); 11] = [
     ("model", model_file),
     ("meshes", meshes),
     ("device", device),
+    ("saved", saved),
     ("session", session),
     ("guests", guests),
     ("mesh", mesh),
@@ -148,6 +150,41 @@ pub fn device(bytes: &[u8]) {
     if let Ok(replay) = Replay::read(bytes) {
         assert!(replay.records().iter().all(|record| record.sample.position.iter().all(|x| x.is_finite())));
     }
+}
+
+/// Bodies of saved games. One that was taken must go on, with finite numbers, and be saved again.
+pub fn saved(bytes: &[u8]) {
+    let Ok(saved) = postcard::from_bytes::<SavedBody>(bytes) else { return };
+    let Ok((mut body, _)) = Body::restore(loose(), BodyConfig::default(), &saved, None) else { return };
+    body.set_obstacles(ground()).expect("sound");
+    for _ in 0..4 {
+        if body.step().is_err() {
+            break;
+        }
+    }
+    let state = body.state();
+    let numbers = [&state.q, &state.v, &state.a, &state.z, &state.s];
+    assert!(numbers.into_iter().flatten().all(|x| x.is_finite()));
+    assert!(body.contacts().contacts().iter().flat_map(|contact| contact.force).all(f64::is_finite));
+    body.save(|_| true);
+}
+
+/// A body that lies on the ground and is held, after some steps.
+pub fn saved_body() -> SavedBody {
+    let (settings, _) = falls();
+    let config = BodyConfig { settings, ..BodyConfig::default() };
+    let mut body = Body::new(loose(), config).expect("sound");
+    body.set_obstacles(ground()).expect("sound");
+    let patch = pliant_modal::Patch::around(body.model().surface(), 3, 0.1).expect("sound");
+    body.grab(&patch, GrabConfig::default()).expect("room");
+    for _ in 0..30 {
+        body.step().expect("sound");
+    }
+    body.save(|_| true)
+}
+
+fn ground() -> Vec<Arc<dyn pliant_modal::ObstacleShape>> {
+    vec![Arc::new(Plane::GROUND)]
 }
 
 /// A tetrahedron with two invented modes, held at a vertex.

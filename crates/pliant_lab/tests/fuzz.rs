@@ -275,4 +275,5 @@ fn corpora_are_written() {
         recorder.write(&Record { now: f64::from(k), dt: 1.0, sample, wrench: Wrench::default() }).unwrap();
     }
     write("device", "three", &recorder.finish().unwrap());
+    write("saved", "lies", &postcard::to_allocvec(&targets::saved_body()).unwrap());
 }

@@ -6,11 +6,14 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    Body, BodyConfig, Contact, GrabConfig, GrabId, HeldPlace, HeldShapes, ModalModel, ModelHash, Patch,
-    State, StepError, StepSettings, Touched,
+    Body, BodyConfig, Contact, ContactState, GrabConfig, GrabId, HeldPlace, HeldShapes, ModalModel,
+    ModelHash, Patch, State, StepError, StepSettings, Touched,
     contact::{Memory, Place},
     error::finite,
 };
+
+/// Most contacts that saved data may have, because each costs time in the next step.
+const MOST_CONTACTS: usize = 16 * ContactState::MAX;
 
 /// A [`Body`] as data that can be written to a file, made by [`Body::save`].
 ///
@@ -159,10 +162,21 @@ impl Body {
         let SavedContacts { friction, theta, lost, memory, list } = &saved.contacts;
         body.set_friction(*friction)?;
         finite("saved contacts", &[*theta, *lost])?;
+        for got in [memory.len(), list.len()].into_iter().filter(|got| *got > MOST_CONTACTS) {
+            return Err(StepError::Length { what: "saved contacts", expected: MOST_CONTACTS, got });
+        }
         for Memory { force, anchor, toward, place, .. } in memory {
             let weights = place.as_ref().map_or([0.0; 3], Place::weights);
             finite("saved contacts", &weights)?;
             [force, anchor, toward].into_iter().try_for_each(|x| finite("saved contacts", x.as_slice()))?;
+        }
+        let count = body.model().surface().positions().len();
+        for Contact { vertex, point, normal, force, penetration, .. } in list {
+            if *vertex as usize >= count {
+                return Err(StepError::Vertex { vertex: *vertex, count });
+            }
+            [point, normal, force].into_iter().try_for_each(|x| finite("saved contacts", x))?;
+            finite("saved contacts", &[*penetration])?;
         }
         let modes = body.mode_count();
         let contacts = body.contacts_mut();

@@ -1,0 +1,4 @@
+//! Bodies of saved games.
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| pliant_fuzz::saved(bytes));
