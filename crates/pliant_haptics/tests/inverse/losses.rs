@@ -43,6 +43,17 @@ impl Pulled {
             self.cycle.step(&mut self.scheduler, &self.model, &mut self.events);
         }
     }
+
+    /// Runs until the motors have 0.4 N. On a busy machine a force is renewed late in real time, so
+    /// that it begins anew at zero.
+    #[track_caller]
+    fn run_to_the_force(&mut self, service: &Service, when: &str) {
+        machine::until(when, || {
+            self.run(50);
+            let motor = service.desk().motor;
+            if (motor - 0.4).abs() < 1e-3 { Ok(()) } else { Err(motor) }
+        });
+    }
 }
 
 /// Says by `field` of the status that something is missing, for a while in the middle of a grab.
@@ -52,9 +63,7 @@ fn without(field: &str, want: LoopState) -> Vec<LoopEvent> {
     let service = Service::start(true);
     service.desk().status = ready();
     let mut pulled = Pulled::new(&service);
-    pulled.run(400);
-    let before = service.desk().motor;
-    assert!((before - 0.4).abs() < 1e-3, "{field}: {before} N before");
+    pulled.run_to_the_force(&service, "the force before");
     pulled.events.clear();
     service.desk().status[field] = json!(false);
     // The answer to the first command says it, and the second command is without a force.
@@ -62,17 +71,15 @@ fn without(field: &str, want: LoopState) -> Vec<LoopEvent> {
     let at_once = service.desk().motor;
     pulled.run(400);
     let meanwhile = service.desk().motor;
-    println!("Inverse without `{field}`: {before:.3} N, then {at_once:.3} N, {meanwhile:.3} N in the end");
+    println!("Inverse without `{field}`: 0.4 N, then {at_once:.3} N, {meanwhile:.3} N in the end");
     assert_eq!((at_once, meanwhile), (0.0, 0.0), "{field}: no force is sent");
     assert_eq!(pulled.cycle.report().state, want, "{field}");
     let events = std::mem::take(&mut pulled.events);
     service.desk().rise = 0.0;
     service.desk().status = ready();
-    pulled.run(1000);
-    let after = service.desk().motor;
+    pulled.run_to_the_force(&service, "the force afterwards");
     let rise = service.desk().rise;
-    println!("Inverse with `{field}` again: {after:.3} N, rises by at most {rise:.4} N a period");
-    assert!((after - 0.4).abs() < 1e-3, "{field}: {after} N afterwards");
+    println!("Inverse with `{field}` again: 0.4 N, rises by at most {rise:.4} N a period");
     // The ramp brings the peak force of 10 N in 0.3 s, and 0.4 N are 1.3 mN per period.
     assert!(rise < 0.002, "{field}: by the ramp, not by a kick of {rise} N");
     assert_eq!(pulled.cycle.report().state, LoopState::Running, "{field}");
@@ -110,16 +117,16 @@ fn an_inverse_is_not_calibrated_until_a_message_says_so() {
         assert!(service.desk().forces.iter().flatten().all(|x| *x == 0.0), "no force before");
         if says {
             service.desk().status = ready();
+            pulled.run_to_the_force(&service, "a message says that it is calibrated");
+        } else {
+            pulled.run(1000);
+            let motor = service.desk().motor;
+            assert_eq!(motor, 0.0, "no message says it");
         }
-        pulled.run(1000);
-        let motor = service.desk().motor;
-        assert_eq!(motor > 0.39, says, "{motor} N");
         service.desk().status_once = false;
         service.desk().status = ready();
         pulled.cycle.device_mut().reopen().unwrap();
-        pulled.run(1000);
-        let motor = service.desk().motor;
-        assert!(motor > 0.39, "{motor} N after a new connection");
+        pulled.run_to_the_force(&service, "after a new connection");
     }
 }
 
