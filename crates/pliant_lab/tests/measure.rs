@@ -15,7 +15,7 @@ use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::peer::LateInputRepair;
 use pliant_stream::wire::AccelerationCoding;
 use pliant_stream::{Newmark, Predict, RecoveryConfig};
-use support::bar;
+use support::{bar, loose_bar};
 
 fn paper1(loss: Loss) -> LinkConfig {
     LinkConfig { loss, ..LinkConfig::preset(Preset::Paper1) }
@@ -496,4 +496,31 @@ fn what_is_not_shown_counts_as_missing_and_as_wrong() {
     let gap = run(&link(Loss::Burst { first: 100, count: 60 }), "default", 10.0, 1);
     assert!((5..=60).contains(&gap.missing) && gap.max_percent > 1.0, "{gap:?}");
     assert!(gap.ticks + gap.missing >= 398, "{gap:?}");
+}
+
+#[test]
+fn a_free_body_is_measured_with_its_pose() {
+    let link = |loss| LinkConfig { loss, delay: Duration::from_millis(10), ..LinkConfig::default() };
+    let run = |loss| {
+        let mut e = Experiment::new(loose_bar(20, 0.05), link(loss), RecoveryConfig::default());
+        e.seconds = 10.0;
+        let reach = e.hands[0].reach.iter().copied().fold(0.0, f64::max);
+        (e.run().unwrap(), reach, e)
+    };
+    let (whole, reach, e) = run(Loss::None);
+    show("free", &whole);
+    assert!(whole.scale > 0.5 * reach, "{} m of {reach} m", whole.scale);
+    assert!(whole.max_percent < 0.1, "{whole:?}");
+    // Without frames the picture stays where it was, while the hands carry the body away: at the
+    // end it is far off. Its modal coordinates alone differ by 8 % there.
+    let (none, ..) = run(Loss::Burst { first: 0, count: 100_000 });
+    show("free, no frames", &none);
+    assert!(none.end_percent > 50.0, "{} %", none.end_percent);
+    for repair in [LateInputRepair::Rollback, LateInputRepair::Compensate] {
+        let f = e.run_peers(repair).unwrap();
+        show("free, peers", &f);
+        assert!(f.scale > 0.5 * reach && f.missing == 0, "{} m of {reach} m", f.scale);
+        // Each hand is 10 ms away, and a hand moves by less than a tenth of its reach meanwhile.
+        assert!((1e-4..5.0).contains(&f.rms_of_motion_percent), "{} %", f.rms_of_motion_percent);
+    }
 }

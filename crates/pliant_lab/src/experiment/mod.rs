@@ -20,7 +20,6 @@ use pliant_stream::{
 
 use crate::pair::{Pair, PathConfig};
 use run::Run;
-use shape_error::ShapeError;
 
 /// Visual error above which a body counts as not recovered, as a share of the largest displacement.
 const RECOVERED: f64 = 0.005;
@@ -118,7 +117,8 @@ impl HandScript {
 }
 
 /// Results of a run. Percentages are relative to the largest true displacement, or for reactions to
-/// the largest true reaction.
+/// the largest true reaction. The displacement of a free body is that from where its model places
+/// it at rest, with its pose.
 #[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
 pub struct Metrics {
     /// Ticks that the guest showed.
@@ -143,7 +143,8 @@ pub struct Metrics {
     pub max_percent: f64,
     /// Visual error at the last tick, shown or missing.
     pub end_percent: f64,
-    /// Error of the confirmed state at the last tick.
+    /// Error of the confirmed state at the last tick. Of a free body, the modal coordinates are the
+    /// confirmed ones, and the pose is the visual one.
     pub confirmed_end_percent: f64,
     /// Error of the visual reactions, root mean square. A reaction that is not shown counts as
     /// zero.

@@ -11,7 +11,8 @@ use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
 use super::run::force_error;
-use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, model_error, norm};
+use super::shape_error::{Picture, ShapeError};
+use super::{BODY, Experiment, Metrics, RECOVERED, fold, model_error, norm};
 
 /// Interval at which a peer's application updates its session.
 const LOOK: Duration = Duration::from_millis(5);
@@ -26,14 +27,14 @@ type Reactions = Vec<(UserId, [f64; 3])>;
 
 struct PeerSample {
     at: Duration,
-    q: Vec<f64>,
+    picture: Picture,
     reactions: Reactions,
 }
 
 /// What the peers agree on at each tick, once all inputs are known.
 #[derive(Default)]
 struct Agreed {
-    q: BTreeMap<Tick, Vec<f64>>,
+    shapes: BTreeMap<Tick, Picture>,
     reactions: BTreeMap<Tick, Reactions>,
 }
 
@@ -180,7 +181,11 @@ impl Experiment {
                     answered = unanswered.front().map_or(answered, |(at, _)| answered.max(now - *at));
                     seen.insert(
                         peers[1].tick(),
-                        PeerSample { at: now, q: body.visual().q.clone(), reactions },
+                        PeerSample {
+                            at: now,
+                            picture: Picture { q: body.visual().q.clone(), pose: body.pose() },
+                            reactions,
+                        },
                     );
                 }
                 while let Some(out) = peers[k].poll_output() {
@@ -193,10 +198,11 @@ impl Experiment {
             }
             // The confirmed state of the first peer counts as the true state.
             let confirmed = peers[0].confirmed();
-            let next = agreed.q.keys().next_back().map_or(0, |last| last + 1);
+            let next = agreed.shapes.keys().next_back().map_or(0, |last| last + 1);
             for tick in next.min(confirmed.saturating_sub(8))..=confirmed {
                 if let Some(state) = peers[0].state_at(BODY, tick) {
-                    agreed.q.insert(tick, state.q.clone());
+                    let pose = peers[0].pose_at(BODY, tick);
+                    agreed.shapes.insert(tick, Picture { q: state.q.clone(), pose });
                     if let Some(r) = peers[0].reactions_at(BODY, tick) {
                         agreed.reactions.insert(tick, r);
                     }
@@ -213,9 +219,9 @@ impl Experiment {
         let Session { seen, sent, .. } = session;
         // The start of the grabs is not measured, nor is the end, on which nobody agrees yet.
         let Some(first) = seen.keys().next().copied() else { return Metrics::default() };
-        let truth: Vec<(Tick, &Vec<f64>)> = agreed.q.range(first..).map(|(t, q)| (*t, q)).collect();
+        let truth: Vec<(Tick, &Picture)> = agreed.shapes.range(first..).map(|(t, seen)| (*t, seen)).collect();
         let shape = ShapeError::new(&self.model);
-        let scale = truth.iter().map(|(_, q)| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
+        let scale = truth.iter().map(|(_, real)| shape.size(real).1.sqrt()).fold(0.0, f64::max);
         let all = || agreed.reactions.range(first..).flat_map(|(_, r)| r);
         let force_scale = all().map(|r| norm(r.1)).fold(0.0, f64::max);
         let mut f = Metrics { scale, force_scale, lost: session.lost, ..Metrics::default() };
@@ -224,21 +230,19 @@ impl Experiment {
         let (mut above, mut longest) = (None, Duration::ZERO);
         let mut hash = 0xCBF2_9CE4_8422_2325;
         let mut picture = None;
-        for (tick, q) in truth {
+        for (tick, real) in truth {
             // The picture of the last tick that was shown stands in the place of one that was not.
             if let Some(shown) = seen.get(&tick) {
                 picture = Some(shown);
                 f.ticks += 1;
-                for q in &shown.q {
-                    hash = fold(hash, &q.to_bits().to_le_bytes());
-                }
+                hash = shown.picture.fold(hash);
             } else {
                 f.missing += 1;
             }
             let Some(s) = picture else { continue };
-            let (total, most) = shape.compare(&s.q, q);
+            let (total, most) = shape.compare(&s.picture, real);
             sum += total;
-            motion += shape.compare(q, &[]).0;
+            motion += shape.size(real).0;
             largest = largest.max(most);
             last = most;
             if most.sqrt() > RECOVERED * scale {

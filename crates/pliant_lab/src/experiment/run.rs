@@ -10,7 +10,8 @@ use pliant_stream::{
     GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, RigidState, TickState, UserId,
 };
 
-use super::{BODY, Experiment, HandScript, Metrics, RECOVERED, ShapeError, TrackPoint, fold, norm};
+use super::shape_error::{Picture, ShapeError};
+use super::{BODY, Experiment, HandScript, Metrics, RECOVERED, TrackPoint, norm};
 use crate::pair::World;
 
 /// True states kept for comparison, ticks.
@@ -24,7 +25,7 @@ struct ExperimentGrab {
 struct Truth {
     tick: u64,
     at: Duration,
-    q: Vec<f64>,
+    picture: Picture,
     reactions: Vec<(GrabKey, [f64; 3])>,
 }
 
@@ -43,18 +44,17 @@ pub(super) fn force_error<K: PartialEq>(truth: &[(K, [f64; 3])], shown: &[(K, [f
 /// The entry of the track for a tick: the first hand, along one axis.
 fn track(
     tick: u64,
-    row: &[f64],
+    hand: &ShapeError,
     axis: usize,
     truth: &Truth,
-    shown: &[f64],
+    shown: &Picture,
     played: &[(GrabKey, [f64; 3])],
 ) -> TrackPoint {
-    let dot = |q: &[f64]| q.iter().zip(row).map(|(q, r)| q * r).sum::<f64>();
     let of_first =
         |all: &[(GrabKey, [f64; 3])]| all.iter().find(|r| r.0.grab == 0).map_or(0.0, |r| r.1[axis]);
     TrackPoint {
         tick,
-        displacement: [dot(&truth.q), dot(shown)],
+        displacement: [hand.first(axis, &truth.picture), hand.first(axis, shown)],
         reaction: [of_first(&truth.reactions), of_first(played)],
     }
 }
@@ -66,9 +66,9 @@ pub(super) struct Run {
     hands: Vec<ExperimentGrab>,
     truth: VecDeque<Truth>,
     shape: ShapeError,
-    /// The axis of the tracks, and the row of the first hand's vertex along it.
+    /// The axis of the tracks, and the first hand's vertex.
     track_axis: usize,
-    track_row: Vec<f64>,
+    track_hand: ShapeError,
     keep_track: bool,
     held_shapes: bool,
     /// The guest's hand, and its grab once it has begun.
@@ -102,10 +102,10 @@ pub(super) struct Run {
     hash: u64,
     track: Vec<TrackPoint>,
     last_tick: u64,
-    /// Time of the last shown tick, and its coordinates. They stay visible until the next shown
+    /// Time of the last shown tick, and what it showed, which stays visible until the next shown
     /// tick.
     displayed_at: Option<Duration>,
-    picture: Vec<f64>,
+    picture: Picture,
     /// The reactions that were shown with it. A device goes on playing them.
     played: Vec<(GrabKey, [f64; 3])>,
     /// Ticks missed since then.
@@ -117,13 +117,10 @@ pub(super) struct Run {
 impl Run {
     pub(super) fn new(experiment: &Experiment, body: Body, h: f64) -> Self {
         let model = &experiment.model;
-        let modes = model.mode_count();
         let shape = ShapeError::new(model);
         let reach = experiment.hands.first().map_or([0.0; 3], |hand| hand.reach);
         let track_axis = (0..3).max_by(|a, b| reach[*a].total_cmp(&reach[*b])).unwrap_or(0);
-        let track_row = experiment.hands.first().map_or(Vec::new(), |hand| {
-            (0..modes).map(|mode| f64::from(model.displacement_row(hand.vertex, track_axis, mode))).collect()
-        });
+        let track_hand = ShapeError::at(model, experiment.hands.first().map_or(0, |hand| hand.vertex));
         Self {
             body,
             h,
@@ -131,7 +128,7 @@ impl Run {
             truth: VecDeque::with_capacity(KEPT),
             shape,
             track_axis,
-            track_row,
+            track_hand,
             keep_track: experiment.keep_track,
             held_shapes: experiment.held_shapes,
             guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
@@ -161,7 +158,7 @@ impl Run {
             track: Vec::new(),
             last_tick: 0,
             displayed_at: None,
-            picture: Vec::new(),
+            picture: Picture::default(),
             played: Vec::new(),
             stalled: 0,
             in_row: 0,
@@ -229,13 +226,13 @@ impl Run {
         let first = self.truth.front().map_or(u64::MAX, |truth| truth.tick);
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
         // A guest without any state shows the body at rest. Modes that it does not have count as 0.
-        let (sum, largest) = self.shape.compare(&self.picture, &truth.q);
-        let motion = self.shape.compare(&truth.q, &[]).0;
+        let (sum, largest) = self.shape.compare(&self.picture, &truth.picture);
+        let motion = self.shape.size(&truth.picture).0;
         let forces = force_error(&truth.reactions, &self.played);
         if self.keep_track {
             self.track.push(track(
                 tick,
-                &self.track_row,
+                &self.track_hand,
                 self.track_axis,
                 truth,
                 &self.picture,
@@ -382,8 +379,9 @@ impl World for Run {
         if self.truth.len() >= KEPT {
             self.truth.pop_front();
         }
+        let picture = Picture { q: self.body.q().to_vec(), pose };
         if self.measuring.is_some() {
-            let (_, largest) = self.shape.compare(self.body.q(), &[]);
+            let (_, largest) = self.shape.size(&picture);
             self.scale = self.scale.max(largest.sqrt());
             for g in &grabs {
                 self.force_scale = self.force_scale.max(norm(g.reaction));
@@ -392,7 +390,7 @@ impl World for Run {
         self.truth.push_back(Truth {
             tick,
             at: now,
-            q: self.body.q().to_vec(),
+            picture,
             reactions: grabs.iter().map(|g| (g.key, g.reaction)).collect(),
         });
     }
@@ -412,7 +410,7 @@ impl World for Run {
         }
         if self.measuring.is_none() {
             (self.last_tick, self.displayed_at) = (tick, Some(now));
-            self.picture.clone_from(&shown.q);
+            self.picture = Picture { q: shown.q.clone(), pose: view.pose() };
             return;
         }
         // Ticks that a catch-up skips were never shown. The previous visual state stood in their
@@ -424,12 +422,14 @@ impl World for Run {
         // errors.
         self.in_row = if tick == self.last_tick + 1 { self.in_row + 1 } else { 0 };
         (self.last_tick, self.displayed_at, self.stalled) = (tick, Some(now), 0);
-        self.picture.clone_from(&shown.q);
+        self.picture = Picture { q: shown.q.clone(), pose: view.pose() };
         let Some(first) = self.truth.front().map(|t| t.tick) else { return };
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
-        let (sum, largest) = self.shape.compare(&shown.q, &truth.q);
-        let (_, confirmed_largest) = self.shape.compare(&confirmed.q, &truth.q);
-        let motion = self.shape.compare(&truth.q, &[]).0;
+        let (sum, largest) = self.shape.compare(&self.picture, &truth.picture);
+        // The session has no confirmed pose of a free body, only the shown one.
+        let confirmed = Picture { q: confirmed.q.clone(), pose: view.pose() };
+        let (_, confirmed_largest) = self.shape.compare(&confirmed, &truth.picture);
+        let motion = self.shape.size(&truth.picture).0;
         let at = truth.at;
         self.played.clear();
         self.played.extend(view.grabs().iter().map(|g| (g.key, g.reaction)));
@@ -450,14 +450,19 @@ impl World for Run {
             }
         }
         if self.keep_track {
-            self.track.push(track(tick, &self.track_row, self.track_axis, truth, &shown.q, &self.played));
+            self.track.push(track(
+                tick,
+                &self.track_hand,
+                self.track_axis,
+                truth,
+                &self.picture,
+                &self.played,
+            ));
         }
         self.count += 1;
         self.confirmed_last = confirmed_largest;
         self.delay_sum += now.saturating_sub(at).as_secs_f64();
         self.record(now, sum, motion, largest, forces);
-        for q in &shown.q {
-            self.hash = fold(self.hash, &q.to_bits().to_le_bytes());
-        }
+        self.hash = self.picture.fold(self.hash);
     }
 }
