@@ -162,7 +162,7 @@ impl Body {
         let SavedContacts { friction, theta, lost, memory, list } = &saved.contacts;
         body.set_friction(*friction)?;
         finite("saved contacts", &[*theta, *lost])?;
-        for got in [memory.len(), list.len()].into_iter().filter(|got| *got > MOST_CONTACTS) {
+        if let Some(got) = [memory.len(), list.len()].into_iter().find(|got| *got > MOST_CONTACTS) {
             return Err(StepError::Length { what: "saved contacts", expected: MOST_CONTACTS, got });
         }
         for Memory { force, anchor, toward, place, .. } in memory {

@@ -328,7 +328,7 @@ impl RecordWriter {
 
     /// Checks that a reader will accept the recording with one more record.
     fn room(&self, record: &SessionRecord) -> io::Result<()> {
-        let RecordingLimits { bytes, models } = self.limits;
+        let RecordingLimits { bytes, models, .. } = self.limits;
         if self.written >= bytes {
             return Err(io::Error::other(format!("more than {bytes} bytes")));
         }
