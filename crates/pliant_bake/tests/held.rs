@@ -517,3 +517,21 @@ fn a_body_of_which_one_of_two_hands_lets_go_gains_little_and_only_with_its_new_s
         }
     }
 }
+
+/// The shapes of a patch end where its region does, and a wide plate gives way beyond it too. A hand
+/// that presses into its edge turns what it holds.
+#[test]
+fn a_plate_gives_way_beyond_the_shapes_of_the_patch_too() {
+    let config = config();
+    let mesh = shapes::bar([10, 10, 2], [1.0, 1.0, 0.15]).unwrap();
+    let model = model(&mesh, &config);
+    for (name, at, way, force, dent) in [
+        ("a side, a little", [0.7, 1.0, 0.075], [0.002, 0.002, 0.0], 0.015, 0.001),
+        ("the edge, pressed in", [1.0, 0.5, 0.15], [-0.08, 0.0, -0.03], 0.03, 0.008),
+    ] {
+        let patch = Patch::around(model.surface(), vertex(&model, at), 0.12).unwrap();
+        let [without, with] = errors(&mesh, &config, &model, &[(patch, way)]);
+        println!("{name}: {without:?} without, {with:?} with");
+        assert!(with[0] < force && with[1] < dent, "{name}: {with:?}");
+    }
+}

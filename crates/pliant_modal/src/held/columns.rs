@@ -33,9 +33,18 @@ const BESIDE: [f64; 2] = [0.25, 0.04];
 /// Largest energy density of a shape beside, as a share of Young's modulus.
 const ENERGY: f64 = 0.02;
 
-/// Number of times that shapes on the paths of hands are corrected, and the number of columns that
-/// each time adds.
-const CORRECTIONS: (usize, usize) = (3, 6);
+/// Maximum number of times that shapes on the paths of hands are corrected, and those around hands
+/// that are at rest. With fewer or more there, a free bar that was then torn by 70 % swung more and
+/// more.
+const CORRECTIONS: usize = 6;
+const AT_REST: usize = 3;
+
+/// Number of columns that each time adds.
+const ADDED: usize = 6;
+
+/// Share of its energy by which the shape at the ends of the paths is corrected at which corrections
+/// end.
+const ENOUGH: f64 = 5e-4;
 
 /// Number of points outside of the region that find shapes on the paths of hands. Inside, all
 /// points do: with half of them, the shapes bend where no point is, and pressing hands are off by
@@ -127,13 +136,17 @@ impl Columns {
         let points = columns.some_points(model, region);
         let mut shapes =
             led(model, law, &columns.omega(model), &points, &columns.rows(region, loads), displacements)?;
-        let (times, more) = CORRECTIONS;
-        for _ in 0..times {
-            let Some(new) = columns.corrections(model, region, loads, law, &shapes, more) else { break };
+        let is_at_rest = displacements.iter().all(|displacement| *displacement == Vector3::zeros());
+        for _ in 0..if is_at_rest { AT_REST } else { CORRECTIONS } {
+            let new = columns.corrections(model, region, loads, law, &shapes, displacements);
+            let Some((new, share)) = new else { break };
             shapes = widened(&shapes, columns.width, new.width);
             columns = columns.with(&new);
             let points = columns.some_points(model, region);
             shapes = columns.again(model, region, loads, law, &points, shapes)?;
+            if share.is_some_and(|share| share <= ENOUGH) {
+                break;
+            }
         }
         let keep = KEPT[0] + KEPT[1] * (loads.len() - 1);
         let (columns, shapes) =
@@ -213,8 +226,9 @@ impl Columns {
     }
 
     /// Makes columns that correct shapes: the displacements by which a Newton step changes them,
-    /// less what the columns and the coordinates have of them. The `most` with the largest shares
-    /// of the energy are kept. Returns `None` if there are none.
+    /// less what the columns and the coordinates have of them. Those with the largest shares of the
+    /// energy are kept. Returns them with the share of its energy by which the shape at the ends of
+    /// the paths is corrected, if there is one, and `None` if there are no columns.
     fn corrections(
         &self,
         model: &ModalModel,
@@ -222,13 +236,14 @@ impl Columns {
         loads: &[NodeLoad],
         law: Hyperelastic,
         shapes: &[GuidedShape],
-        most: usize,
-    ) -> Option<Self> {
+        displacements: &[Vector3<f64>],
+    ) -> Option<(Self, Option<f64>)> {
         let (omega, width) = (self.omega(model), shapes.len());
         if width == 0 {
             return None;
         }
-        let mut values = region.corrections(loads, shapes, self, law);
+        let end = shapes.iter().position(|shape| shape.there == displacements);
+        let mut values = region.corrections(loads, shapes, self, law, end.map(|end| &shapes[end].q[..]));
         // What matters is the share of a shape's energy that is corrected.
         let scales: Vec<f64> = shapes
             .iter()
@@ -242,8 +257,10 @@ impl Columns {
             return None;
         }
         let energies = region.energies([&values, &values], [width; 2]);
+        let share = end.map(|end| energies[end * width + end]);
         let corrections = Self { values, width, parts: Vec::new() };
-        corrections.beside(model, region, &energies, CORRECTION, most, Some(self))
+        let columns = corrections.beside(model, region, &energies, CORRECTION, ADDED, Some(self))?;
+        Some((columns, share))
     }
 
     /// These columns and more.

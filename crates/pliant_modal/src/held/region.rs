@@ -11,7 +11,7 @@ use super::{
 use crate::{
     Element, Hyperelastic, Patch,
     cubature::{GuidedShape, Point, Rows},
-    nonlinear::{LANES, Lane},
+    nonlinear::{LANES, Lane, positive_tangent},
     simd::widest,
     tetrahedron::{self, Affine, MAX_NODES},
 };
@@ -269,8 +269,24 @@ impl<'a> Region<'a> {
         out
     }
 
-    /// Displacements by which a Newton step with the stiffness at rest corrects shapes in which the
-    /// patches are held. The shapes are those of columns and coordinates; the result is
+    /// The stiffness of the region in a shape of columns and coordinates, positive semidefinite.
+    fn stiffness_in(&self, q: &[f64], columns: &Columns, law: Hyperelastic) -> Stiffness {
+        let rows = self.node_rows(columns);
+        let u: Vec<f64> =
+            rows.chunks_exact(q.len()).map(|row| row.iter().zip(q).map(|(u, q)| u * q).sum()).collect();
+        let mut gradients = Vec::new();
+        let mut h = [Matrix3::zeros()];
+        for element in 0..self.elements.len() {
+            self.at_points(element, &u, &mut h, |_, _, _, h| gradients.push(h[0]));
+        }
+        let per = tetrahedron::stiffness_points(self.kind).0.len();
+        self.stiffness.with_tangents(self.kind, &self.nodes, &self.affine, |element, point| {
+            positive_tangent(law, &gradients[element * per + point])
+        })
+    }
+
+    /// Displacements by which a Newton step with the stiffness in the shape `at`, or at rest,
+    /// corrects shapes in which the patches are held. The shapes are those of columns and coordinates; the result is
     /// `[node][axis][shape]`.
     pub(super) fn corrections(
         &self,
@@ -278,7 +294,10 @@ impl<'a> Region<'a> {
         shapes: &[GuidedShape],
         columns: &Columns,
         law: Hyperelastic,
+        at: Option<&[f64]>,
     ) -> Vec<f64> {
+        let tangent = at.map(|q| self.stiffness_in(q, columns, law));
+        let stiffness = tangent.as_ref().unwrap_or(&self.stiffness);
         let nodes = self.node_count();
         let mut out = vec![0.0; 3 * nodes * shapes.len()];
         let elements: Vec<Sample> = self
@@ -313,7 +332,7 @@ impl<'a> Region<'a> {
                     }
                 }
             }
-            self.stiffness.solve(&self.free_for_any, &mut forces, CORRECTED);
+            stiffness.solve(&self.free_for_any, &mut forces, CORRECTED);
             write(&forces, shapes.len(), group * LANES, &mut out);
         }
         out

@@ -2,7 +2,7 @@
 //!
 //! Eight columns go in the lanes of one field of displacements or forces.
 
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, SMatrix};
 
 use crate::{
     Element, Hyperelastic,
@@ -80,11 +80,13 @@ impl Stiffness {
             columns.extend_from_slice(&row);
             offsets.push(columns.len());
         }
-        let mut blocks = vec![Matrix3::zeros(); columns.len()];
+        let blocks = vec![Matrix3::zeros(); columns.len()];
+        let mut out = Self { offsets, columns, blocks };
         let tangent = law.tangent(&Matrix3::zeros());
         let (points, share) = tetrahedron::stiffness_points(kind);
         for (nodes, affine) in elements.iter().zip(affine) {
-            // The sum over the points of the products of the gradients of two nodes.
+            // All points have the same tangent: it meets the sum over the points of the products of
+            // the gradients of two nodes.
             let mut products = [[[[0.0; 3]; 3]; MAX_NODES]; MAX_NODES];
             for &point in points {
                 let g = affine.shape_gradients(kind, point);
@@ -105,19 +107,61 @@ impl Stiffness {
                             block += share * affine.volume * product * part;
                         }
                     }
-                    let mut add = |a: usize, b: usize, block: Matrix3<f64>| {
-                        let start = offsets[nodes[a] as usize];
-                        let row = &columns[start..offsets[nodes[a] as usize + 1]];
-                        blocks[start + row.partition_point(|c| *c < nodes[b])] += block;
-                    };
-                    add(a, b, block);
-                    if a != b {
-                        add(b, a, block.transpose());
-                    }
+                    out.add(nodes[a], nodes[b], block);
                 }
             }
         }
-        Self { offsets, columns, blocks }
+        out
+    }
+
+    /// The stiffness of the same elements where `tangent` gives that of the material in a point of
+    /// an element.
+    pub(super) fn with_tangents(
+        &self,
+        kind: Element,
+        elements: &[[u32; MAX_NODES]],
+        affine: &[Affine],
+        mut tangent: impl FnMut(usize, usize) -> SMatrix<f64, 9, 9>,
+    ) -> Self {
+        let blocks = vec![Matrix3::zeros(); self.columns.len()];
+        let mut out = Self { offsets: self.offsets.clone(), columns: self.columns.clone(), blocks };
+        let per = kind.node_count();
+        let (points, share) = tetrahedron::stiffness_points(kind);
+        for (element, (nodes, affine)) in elements.iter().zip(affine).enumerate() {
+            let mut sums = [[Matrix3::zeros(); MAX_NODES]; MAX_NODES];
+            for (number, &point) in points.iter().enumerate() {
+                let g = affine.shape_gradients(kind, point);
+                let tangent = tangent(element, number) * (share * affine.volume);
+                for (a, sums) in sums[..per].iter_mut().enumerate() {
+                    // The force on the node of this row by each entry of a displacement gradient.
+                    let rows = tangent.fixed_rows::<3>(0) * g[a][0]
+                        + tangent.fixed_rows::<3>(3) * g[a][1]
+                        + tangent.fixed_rows::<3>(6) * g[a][2];
+                    for (sum, g) in sums[..=a].iter_mut().zip(&g) {
+                        for (d, g) in g.iter().enumerate() {
+                            *sum += rows.fixed_columns::<3>(3 * d) * *g;
+                        }
+                    }
+                }
+            }
+            for (a, row) in sums[..per].iter().enumerate() {
+                row[..=a].iter().enumerate().for_each(|(b, &block)| out.add(nodes[a], nodes[b], block));
+            }
+        }
+        out
+    }
+
+    /// Adds the block of two nodes, and its transpose on the other side of the diagonal.
+    fn add(&mut self, a: u32, b: u32, block: Matrix3<f64>) {
+        let mut add = |a: u32, b: u32, block: Matrix3<f64>| {
+            let start = self.offsets[a as usize];
+            let row = &self.columns[start..self.offsets[a as usize + 1]];
+            self.blocks[start + row.partition_point(|c| *c < b)] += block;
+        };
+        add(a, b, block);
+        if a != b {
+            add(b, a, block.transpose());
+        }
     }
 
     /// Computes `out = K x` for columns stored as `[node][axis][column]`.

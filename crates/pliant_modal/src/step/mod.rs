@@ -24,4 +24,4 @@ pub use state::State;
 
 pub(crate) use gravity::MassSites;
 pub(crate) use kernel::group;
-pub(crate) use patch::{Six, Tangent, contact_floor, displacement, tangent};
+pub(crate) use patch::{Six, Tangent, contact_floor, displacement, residual, tangent};
