@@ -208,7 +208,7 @@ fn a_guest_feels_in_its_hand_what_the_host_steps() {
         ("pulled", corner, [1.0, 0.1, 0.1], [0.0, 0.06, 0.053]),
         ("pressed", middle, [0.5, 0.1, 0.05], [0.0, -0.08, 0.0]),
     ] {
-        let place = HeldPlace { vertex, radius: RADIUS, way };
+        let place = HeldPlace { vertex, radius: RADIUS, displacement: way };
         let shapes = HeldShapes::of_places(&model, &[place]).unwrap().map(Arc::new);
         for preset in [Preset::Paper1, Preset::Wifi, Preset::Paper4] {
             let [without, with] = [false, true].map(|with| {

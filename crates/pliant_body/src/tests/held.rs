@@ -166,7 +166,7 @@ fn a_body_of_fewer_coordinates_or_of_linear_elasticity_gets_no_shapes() {
 fn the_cache_is_bounded_and_knows_what_has_no_shapes() {
     let _app = app();
     let mut cache = HeldShapesCache::default();
-    let at = |vertex| HeldPlace { vertex, radius: 0.1, way: [0.0; 3] };
+    let at = |vertex| HeldPlace { vertex, radius: 0.1, displacement: [0.0; 3] };
     let linear = Arc::new(super::model::bar());
     assert!(matches!(cache.get(&linear, &[at(0)]), Some(None)), "a linear model");
     let model = Arc::new(bar());

@@ -112,11 +112,11 @@ fn a_goodbye_is_heard_also_when_others_flood_the_same_frame() {
     // which is its budget.
     inbox.message(LEAVER, &GuestMessage::Goodbye { reason: DisconnectReason::Left });
     let mut sent = 0;
-    for input in (1..1000).step_by(3) {
+    for input in (1..1000u32).step_by(3) {
         for peer in holders.clone() {
             let target =
                 |k| TargetEntry { grab: 0, input: input + k, target: [1.0, 1e-4 * f64::from(k), 0.0] };
-            let datagram = Datagram::Targets(Targets { entries: (0..3).map(target).collect() });
+            let datagram = Datagram::Targets(Targets { entries: (0..3u32).map(target).collect() });
             let bytes = datagram.encode(input as u16).into();
             inbox.push(Event::Datagram { peer: PeerId(peer), at: Instant::now(), bytes });
             sent += 3;
