@@ -158,7 +158,7 @@ impl HeldShapes {
 
     /// Returns the places that a body needs shapes for, where those that it has do not suffice:
     /// they are of other patches, or hands have gone farther than a fiftieth of the size and a
-    /// quarter of their displacement since. No places: the body needs no shapes any more.
+    /// tenth of their displacement since. No places: the body needs no shapes any more.
     ///
     /// At most [`HeldShapes::MAX_PATCHES`] of the places get shapes. They are in a fixed order, and
     /// their displacements are rounded, so that equal and nearby ones share their shapes.
