@@ -518,8 +518,8 @@ fn a_body_of_which_one_of_two_hands_lets_go_gains_little_and_only_with_its_new_s
     }
 }
 
-/// The shapes of a patch end where its region does, and a wide plate gives way beyond it too. A hand
-/// that presses into its edge turns what it holds.
+/// The shapes of a patch end where its region does, and a wide plate gives way beyond it too. A
+/// hand that presses into its edge turns what it holds.
 #[test]
 fn a_plate_gives_way_beyond_the_shapes_of_the_patch_too() {
     let config = config();

@@ -42,8 +42,8 @@ const AT_REST: usize = 3;
 /// Number of columns that each time adds.
 const ADDED: usize = 6;
 
-/// Share of its energy by which the shape at the ends of the paths is corrected at which corrections
-/// end.
+/// Share of its energy by which the shape at the ends of the paths is corrected at which
+/// corrections end.
 const ENOUGH: f64 = 5e-4;
 
 /// Number of points outside of the region that find shapes on the paths of hands. Inside, all

@@ -21,8 +21,9 @@
 //! it there are further columns, again and again: the columns follow the hands. Those that the
 //! shapes on the way use most are kept. When a hand has gone on, the columns are made anew.
 //!
-//! A body also gives way beyond the region, where the columns end. What the patch's own flexibility
-//! is larger for it than that of the columns stays a compliance between the patch and a single hand.
+//! A body also gives way beyond the region, where the columns end. By what the patch's own
+//! flexibility is larger for it than that of the columns, a compliance stays between the patch and
+//! a single hand.
 //!
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 
@@ -49,6 +50,10 @@ use crate::{
     nonlinear::Gradients,
     step::{contact_floor, residual},
 };
+
+/// What the body gives beyond the region does not count below the first share of the compliance of
+/// a patch in a direction, and all of it counts from the second on.
+const BEYOND: [f64; 2] = [0.025, 0.05];
 
 /// Number of points outside of the region to choose from.
 const OUTSIDE: usize = 400;
@@ -363,12 +368,14 @@ impl HeldShapes {
     }
 }
 
-/// What the columns, whose static compliance is that of `rows`, leave of the residual flexibility of
-/// a patch at the baked stiffness, m/N, body axes. It has no negative part.
+/// What the columns, whose static compliance is that of `rows`, leave of the residual flexibility
+/// of a patch at the baked stiffness, m/N, body axes. It has no negative part.
 ///
-/// It is what the body gives beyond the region, where the columns end. It counts for a single hand
-/// only: what one of several hands moves there, the others move too, so that four hands that twist
-/// the end of a bar, whose forces have no sum, were off by 16 % with their own parts of it.
+/// It is what the body gives beyond the region, where the columns end. The baked flexibility is
+/// interpolated, so that a small share of the whole compliance is no more than its error. It counts
+/// for a single hand only: what one of several hands moves there, the others move too, so that four
+/// hands that twist the end of a bar, whose forces have no sum, were off by 16 % with their own
+/// parts of it.
 fn left_out(
     model: &ModalModel,
     patch: &Patch,
@@ -379,11 +386,20 @@ fn left_out(
     if !is_single {
         return Ok(floor);
     }
-    let whole = residual(model, patch, model.mode_count())? - floor;
+    let whole = residual(model, patch, 0)? - floor;
+    let flexibility = residual(model, patch, model.mode_count())? - floor;
     let dot = |i: usize, j: usize| rows[i].iter().zip(&rows[j]).map(|(a, b)| a * b).sum::<f64>();
-    let eigen = (whole - Matrix3::from_fn(dot)).symmetric_eigen();
-    let more = Matrix3::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0)));
-    Ok(floor + eigen.eigenvectors * more * eigen.eigenvectors.transpose())
+    let left = flexibility - Matrix3::from_fn(dot);
+    // In axes in which the whole compliance is one, what is left is a share of it.
+    let Some(whole) = whole.cholesky() else { return Ok(floor) };
+    let lower = whole.l();
+    let Some(inverse) = lower.try_inverse() else { return Ok(floor) };
+    let eigen = (inverse * left * inverse.transpose()).symmetric_eigen();
+    let [none, all] = BEYOND;
+    let shares = eigen.eigenvalues.map(|x| x.max(0.0) * ((x - none) / (all - none)).clamp(0.0, 1.0));
+    let turn = lower * eigen.eigenvectors;
+    let more = turn * Matrix3::from_diagonal(&shares) * turn.transpose();
+    Ok(if more.iter().all(|x| x.is_finite()) { floor + more } else { floor })
 }
 
 /// Makes the rule of columns and coordinates, from training shapes. Returns `None` without any.

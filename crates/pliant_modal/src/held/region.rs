@@ -286,8 +286,8 @@ impl<'a> Region<'a> {
     }
 
     /// Displacements by which a Newton step with the stiffness in the shape `at`, or at rest,
-    /// corrects shapes in which the patches are held. The shapes are those of columns and coordinates; the result is
-    /// `[node][axis][shape]`.
+    /// corrects shapes in which the patches are held. The shapes are those of columns and
+    /// coordinates; the result is `[node][axis][shape]`.
     pub(super) fn corrections(
         &self,
         loads: &[NodeLoad],

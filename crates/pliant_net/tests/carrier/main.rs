@@ -1,7 +1,6 @@
 //! Tests of sessions that ride on an app's own carrier.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod crowd;
 mod network;
 mod port;
 mod sessions;
