@@ -313,10 +313,12 @@ impl RecordWriter {
     /// Removes the oldest recordings of the folder if all have too many bytes.
     ///
     /// # Errors
-    /// An error if none can be removed, and errors of the operating system.
+    /// An error if none can be removed.
     fn room_in_folder(&self) -> io::Result<()> {
         let Some(folder) = &self.folder else { return Ok(()) };
-        let (room, budget) = (folder.make_room()?, folder.budget);
+        // A folder that cannot be read now is asked again.
+        let Ok(room) = folder.make_room() else { return Ok(()) };
+        let budget = folder.budget;
         for old in &room.removed {
             info!("{} was removed: the recordings had more than {budget} bytes together", old.display());
         }

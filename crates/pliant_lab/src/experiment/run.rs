@@ -41,24 +41,6 @@ pub(super) fn force_error<K: PartialEq>(truth: &[(K, [f64; 3])], shown: &[(K, [f
     (error, size, truth.len() as u64)
 }
 
-/// The entry of the track for a tick: the first hand, along one axis.
-fn track(
-    tick: u64,
-    hand: &ShapeError,
-    axis: usize,
-    truth: &Truth,
-    shown: &Picture,
-    played: &[(GrabKey, [f64; 3])],
-) -> TrackPoint {
-    let of_first =
-        |all: &[(GrabKey, [f64; 3])]| all.iter().find(|r| r.0.grab == 0).map_or(0.0, |r| r.1[axis]);
-    TrackPoint {
-        tick,
-        displacement: [hand.first(axis, &truth.picture), hand.first(axis, shown)],
-        reaction: [of_first(&truth.reactions), of_first(played)],
-    }
-}
-
 /// The caller's side of the session: the true body, its hands and the comparison.
 pub(super) struct Run {
     body: Body,
@@ -221,6 +203,18 @@ impl Run {
         }
     }
 
+    /// The entry of the track for a tick: the first hand, along one axis, as it is shown.
+    fn track_point(&self, tick: u64, truth: &Truth) -> TrackPoint {
+        let (axis, hand) = (self.track_axis, &self.track_hand);
+        let of_first =
+            |all: &[(GrabKey, [f64; 3])]| all.iter().find(|r| r.0.grab == 0).map_or(0.0, |r| r.1[axis]);
+        TrackPoint {
+            tick,
+            displacement: [hand.first(axis, &truth.picture), hand.first(axis, &self.picture)],
+            reaction: [of_first(&truth.reactions), of_first(&self.played)],
+        }
+    }
+
     /// Counts one missed tick and compares the last visual state with the true state of that tick.
     fn miss(&mut self, now: Duration, tick: u64) {
         let first = self.truth.front().map_or(u64::MAX, |truth| truth.tick);
@@ -229,16 +223,8 @@ impl Run {
         let (sum, largest) = self.shape.compare(&self.picture, &truth.picture);
         let motion = self.shape.size(&truth.picture).0;
         let forces = force_error(&truth.reactions, &self.played);
-        if self.keep_track {
-            self.track.push(track(
-                tick,
-                &self.track_hand,
-                self.track_axis,
-                truth,
-                &self.picture,
-                &self.played,
-            ));
-        }
+        let point = self.keep_track.then(|| self.track_point(tick, truth));
+        self.track.extend(point);
         self.missing += 1;
         self.record(now, sum, motion, largest, forces);
     }
@@ -449,16 +435,8 @@ impl World for Run {
                 *series = (series.1, new);
             }
         }
-        if self.keep_track {
-            self.track.push(track(
-                tick,
-                &self.track_hand,
-                self.track_axis,
-                truth,
-                &self.picture,
-                &self.played,
-            ));
-        }
+        let point = self.keep_track.then(|| self.track_point(tick, truth));
+        self.track.extend(point);
         self.count += 1;
         self.confirmed_last = confirmed_largest;
         self.delay_sum += now.saturating_sub(at).as_secs_f64();

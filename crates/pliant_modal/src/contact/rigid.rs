@@ -42,10 +42,9 @@ pub struct Rigid {
     pub weight: f64,
     /// Set by a step: whether a support holds the body against the contacts.
     pub is_held: bool,
-    /// Set by a step: displacement and turn by the force and the acceleration, m and rad, world
-    /// axes.
+    /// Set by a step: displacement by the force and the acceleration, m, world axes.
     pub displacement: Vector3<f64>,
-    /// As [`Rigid::displacement`].
+    /// Set by a step: turn by the torque, rad, world axes.
     pub turn: Vector3<f64>,
     /// Set by a step: the bodies that may touch it, by their indices.
     pub near: Vec<usize>,

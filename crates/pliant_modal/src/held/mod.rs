@@ -394,12 +394,16 @@ fn left_out(
     let Some(whole) = whole.cholesky() else { return Ok(floor) };
     let lower = whole.l();
     let Some(inverse) = lower.try_inverse() else { return Ok(floor) };
-    let eigen = (inverse * left * inverse.transpose()).symmetric_eigen();
+    let left = inverse * left * inverse.transpose();
+    if !left.iter().all(|x| x.is_finite()) {
+        return Ok(floor);
+    }
+    let eigen = left.symmetric_eigen();
     let [none, all] = BEYOND;
     let shares = eigen.eigenvalues.map(|x| x.max(0.0) * ((x - none) / (all - none)).clamp(0.0, 1.0));
     let turn = lower * eigen.eigenvectors;
     let more = turn * Matrix3::from_diagonal(&shares) * turn.transpose();
-    Ok(if more.iter().all(|x| x.is_finite()) { floor + more } else { floor })
+    Ok(floor + more)
 }
 
 /// Makes the rule of columns and coordinates, from training shapes. Returns `None` without any.
