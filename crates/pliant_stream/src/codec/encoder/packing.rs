@@ -4,6 +4,13 @@ use super::{Encoder, SENT, Sent};
 use crate::state::{GrabKey, TickState};
 use crate::wire::{FrameGrab, MAX_PARTS, Repeat, RepeatGrab, Slice, SliceEntry, TickFrame};
 
+/// A mode is far off where its error in the mirror is larger than this many quantization steps. Of
+/// a body that moves otherwise than receivers compute it (own shapes of held patches, contact), some
+/// modes mostly are. Of others hardly any ever is.
+const FAR: f64 = 16.0;
+/// Largest number of modes in a slice beyond its share, for modes that are far off.
+const MORE: usize = 2;
+
 impl Encoder {
     /// Moves the grabs that do not fit out of a frame, into parts of their own.
     pub(super) fn split(&self, frame: &mut TickFrame, room: usize) -> Vec<TickFrame> {
@@ -56,7 +63,7 @@ impl Encoder {
 
     /// Adds absolute state to the frame and applies it to the mirror. The slice contains the modes
     /// with the largest error in the mirror, and some modes in turn for receivers that missed
-    /// frames.
+    /// frames. It has more modes than its share where several are far off.
     pub(super) fn refresh(&mut self, frame: &mut TickFrame, state: &TickState<'_>, unit: f32, room: usize) {
         if self.subscription.refresh == 0 {
             return;
@@ -82,7 +89,9 @@ impl Encoder {
                 .map_or(0.0, |z| (truth(state.z, k) - z).abs() / self.quanta.place[k]);
             self.wrong.push((eq + ev + ez, k as u16));
         }
-        let most = (share - turn).min(self.wrong.len());
+        let far = FAR * f64::from(unit);
+        let far = self.wrong.iter().filter(|(error, _)| *error > far).count();
+        let most = far.clamp(share - turn, share - turn + MORE).min(self.wrong.len());
         if most > 0 && most < self.wrong.len() {
             self.wrong.select_nth_unstable_by(most - 1, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         }
