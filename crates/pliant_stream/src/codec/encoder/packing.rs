@@ -5,8 +5,8 @@ use crate::state::{GrabKey, TickState};
 use crate::wire::{FrameGrab, MAX_PARTS, Repeat, RepeatGrab, Slice, SliceEntry, TickFrame};
 
 /// A mode is far off where its error in the mirror is larger than this many quantization steps. Of
-/// a body that moves otherwise than receivers compute it (own shapes of held patches, contact), some
-/// modes mostly are. Of others hardly any ever is.
+/// a body that moves otherwise than receivers compute it (own shapes of held patches, contact),
+/// some modes mostly are. Of others hardly any ever is.
 const FAR: f64 = 16.0;
 /// Largest number of modes in a slice beyond its share, for modes that are far off.
 const MORE: usize = 2;
