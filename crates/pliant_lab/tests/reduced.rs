@@ -69,6 +69,27 @@ fn a_thinned_stream_leaves_a_reduced_body_all_of_its_coordinates() {
     assert!(reduced < 1.2 * linear, "{reduced} and {linear}");
 }
 
+/// A guest with a third of the coordinates would see a body that hardly bends.
+#[test]
+fn a_guest_of_few_modes_gets_all_coordinates_of_a_reduced_body() {
+    let model = bar(Some(Material::NeoHookean));
+    let few = Some(model.mode_count() as u16 / 3);
+    for recovery in [RecoveryConfig::default(), RecoveryConfig::paper()] {
+        let [whole, thin] = [None, few].map(|modes| {
+            let link = LinkConfig { loss: Loss::None, ..LinkConfig::preset(Preset::Paper1) };
+            let own = Experiment::new(model.clone(), link, recovery.clone());
+            let run = Experiment { elasticity: Elasticity::Reduced, modes, seconds: 10.0, ..own }.run();
+            run.unwrap()
+        });
+        println!(
+            "{:.4} and {:.4} %, {:.1} and {:.1} bytes",
+            whole.rms_percent, thin.rms_percent, whole.bytes_per_frame, thin.bytes_per_frame
+        );
+        assert!(thin.rms_percent < 2.0 * whole.rms_percent.max(0.05), "{}", thin.rms_percent);
+        assert!(thin.bytes_per_frame <= whole.bytes_per_frame);
+    }
+}
+
 /// The host, the guests and the peers have the own shapes of the patches that are held.
 #[test]
 fn a_session_with_own_shapes_of_held_patches_is_seen_as_well_as_one_without() {

@@ -15,7 +15,8 @@ use crate::remote::RemoteBody;
 /// app writes it, or [`CameraInterest`] does.
 ///
 /// Fewer modes need fewer bytes and less work, and give a coarser shape. Modes are ordered: the
-/// first are the largest motions.
+/// first are the largest motions. A body with reduced elasticity hardly bends without its last
+/// coordinates, so all of these come, refreshed the more rarely.
 #[derive(Component, Reflect, Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub enum Interest {

@@ -49,7 +49,8 @@ pub struct JoinConfig {
     pub transport: JoinOptions,
     /// How loss is repaired. Default: [`RecoveryConfig::default`].
     pub recovery: RecoveryConfig,
-    /// Most modes to accept of each body, for weak machines and slow links. Default: all.
+    /// Most modes to accept of each body, for weak machines and slow links. Of a body with reduced
+    /// elasticity all come, refreshed the more rarely. Default: all.
     pub modes: Option<u16>,
     /// Whether to show the local hands, and report their forces, without the network's delay. A
     /// body that this guest holds is then stepped ahead to the current positions of the hands,

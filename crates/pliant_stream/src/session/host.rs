@@ -64,15 +64,29 @@ impl HostBody {
 
     /// Describes the body to a guest; `None` before the guest has sent its subscription.
     pub(super) fn info(&self, guest: &GuestPeer) -> Option<BodyInfo> {
+        let subscription = self.subscribed(guest.subscription?);
         Some(BodyInfo {
             body: self.id.0,
             name: self.name.clone(),
             hash: self.hash,
-            modes: Encoder::modes_for(&guest.subscription?, self.model.mode_count(), guest.link.max_datagram)
-                as u16,
+            modes: Encoder::modes_for(&subscription, self.model.mode_count(), guest.link.max_datagram) as u16,
             settings: self.settings,
             around: self.around.clone(),
         })
+    }
+
+    /// Returns what a subscription means for this body.
+    ///
+    /// Of a body with reduced elasticity a stream has all modes, because without those that shorten
+    /// it a body hardly bends. Who asks for fewer gets them refreshed more rarely.
+    fn subscribed(&self, mut subscription: StreamSubscription) -> StreamSubscription {
+        let modes = self.model.mode_count().min(usize::from(u16::MAX)) as u16;
+        if self.settings.is_reduced(&self.model) && subscription.modes < modes {
+            let times = modes.div_ceil(subscription.modes.max(1)).min(255) as u8;
+            subscription.refresh = subscription.refresh.saturating_mul(times);
+            subscription.modes = modes;
+        }
+        subscription
     }
 }
 
@@ -453,6 +467,7 @@ pub(super) fn stream_key(peer: &GuestPeer, body: &HostBody) -> Option<StreamKey>
         }
         subscription.modes = subscription.modes.min(step_up(most));
     }
+    subscription = body.subscribed(subscription);
     subscription.modes = Encoder::modes_for(&subscription, model_modes, peer.link.max_datagram) as u16;
     Some((subscription, peer.link.max_datagram))
 }
