@@ -174,7 +174,8 @@ fn simulation_mesh(
     number: &[u32],
     skin: &Skin,
 ) -> Option<SimulationMesh> {
-    if mesh.tets.len() > SimulationMesh::MAX_TETS {
+    let displacements = 3 * fe.nodes.len() * modes.lambda.len();
+    if mesh.tets.len() > SimulationMesh::MAX_TETS || displacements > SimulationMesh::MAX_DISPLACEMENTS {
         return None;
     }
     let corners: Vec<[f32; 3]> = mesh.nodes.iter().map(|p| p.map(|x| x as f32)).collect();

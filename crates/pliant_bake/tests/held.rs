@@ -535,3 +535,33 @@ fn a_plate_gives_way_beyond_the_shapes_of_the_patch_too() {
         assert!(with[0] < force && with[1] < dent, "{name}: {with:?}");
     }
 }
+
+/// When another hand takes hold, both get shapes of another kind. What the first one feels goes
+/// over to the new force within a second, and not at once.
+#[test]
+fn a_hand_feels_no_kick_when_another_takes_hold_or_lets_go() {
+    let model = model(&shapes::bar([10, 10, 2], [1.0, 1.0, 0.15]).unwrap(), &config());
+    let patch = |at| Patch::around(model.surface(), vertex(&model, at), 0.12).unwrap();
+    let mut body = reduced(&model, 1.0 / 60.0, 30.0);
+    let grab = body.grab(&patch([1.0, 0.5, 0.15]), GrabConfig::default()).unwrap();
+    lead_with(&mut body, &[(grab, [-0.08, 0.0, -0.03])], true);
+    let mut last = body.reaction(grab).unwrap();
+    let whole = norm(last);
+    let mut rest = |body: &mut Body, what: &str| {
+        let before = last;
+        let mut most = 0.0f64;
+        for _ in 0..180 {
+            body.make_held_shapes().unwrap();
+            body.step().unwrap();
+            let force = body.reaction(grab).unwrap();
+            (most, last) = (most.max(norm(minus(force, last))), force);
+        }
+        let settled = norm(minus(last, before)) / whole;
+        println!("{what}: {:.2} % a step, {:.2} % in the end", 100.0 * most / whole, 100.0 * settled);
+        assert!(most / whole < 0.25 * settled + 0.01, "{what}: {most} of {whole} N");
+    };
+    let other = body.grab(&patch([0.5, 0.0, 0.15]), GrabConfig::default()).unwrap();
+    rest(&mut body, "another takes hold");
+    body.release(other);
+    rest(&mut body, "it lets go");
+}

@@ -14,6 +14,10 @@ use crate::{
     step::group::{Parts, View},
 };
 
+/// Time constant with which a hand comes back to its target after the shapes of held patches have
+/// changed, s.
+const SLIP_TIME: f64 = 0.25;
+
 /// Identifier of a grab on a body. A body never uses an identifier twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct GrabId(pub(crate) u64);
@@ -84,6 +88,8 @@ pub(crate) struct GrabEntry {
     pub(crate) target: Vector3<f64>,
     /// The target of the previous step, or `None` before the first step of the grab.
     pub(crate) last_target: Option<Vector3<f64>>,
+    /// How far the hand is off its target since the shapes of held patches changed, m, world axes.
+    pub(crate) slip: Vector3<f64>,
     pub(crate) config: GrabConfig,
 }
 
@@ -409,12 +415,15 @@ impl Body {
 
     /// Leads the hands to their targets.
     pub(crate) fn begin_step(&mut self) {
+        let fade = (-self.config.step / SLIP_TIME).exp();
         for (hand, grab) in self.hands.iter_mut().zip(&mut self.grabs) {
             // A hand has no velocity in the first step of its grab.
             let way = grab.last_target.map_or_else(Vector3::zeros, |last| grab.target - last);
-            let (target, config) = (grab.target, grab.config);
+            // Below a nanometer nothing is left, so that a body at rest may sleep.
+            grab.slip = if grab.slip.norm() > 1e-9 { fade * grab.slip } else { Vector3::zeros() };
+            let (target, config) = (grab.target + grab.slip, grab.config);
             hand.hold = Hold::Target { target, velocity: way / self.config.step, config };
-            grab.last_target = Some(target);
+            grab.last_target = Some(grab.target);
         }
     }
 

@@ -39,6 +39,8 @@ struct SavedHand {
     config: GrabConfig,
     target: [f64; 3],
     last_target: Option<[f64; 3]>,
+    #[serde(default)]
+    slip: [f64; 3],
     pull: [f64; 3],
     mean: [f64; 3],
     viscoelastic: [f64; 3],
@@ -89,6 +91,7 @@ impl Body {
                 config: grab.config,
                 target: grab.target.into(),
                 last_target: grab.last_target.map(Into::into),
+                slip: grab.slip.into(),
                 pull: hand.pull.into(),
                 mean: hand.mean.into(),
                 viscoelastic: hand.viscoelastic.into(),
@@ -135,7 +138,7 @@ impl Body {
         let mut ids = Vec::with_capacity(saved.hands.len());
         for hand in &saved.hands {
             let [target, last] = [hand.target, hand.last_target.unwrap_or_default()];
-            for values in [target, last, hand.pull, hand.mean, hand.viscoelastic] {
+            for values in [target, last, hand.slip, hand.pull, hand.mean, hand.viscoelastic] {
                 finite("saved hand", &values)?;
             }
             let patch = Patch::around(body.model().surface(), hand.vertex, hand.radius);
@@ -151,6 +154,9 @@ impl Body {
             }
         }
         body.set_held_shapes(shapes)?;
+        for (grab, hand) in body.grabs.iter_mut().zip(&saved.hands) {
+            grab.slip = hand.slip.into();
+        }
         let columns = body.held_shapes().map_or(0, |shapes| shapes.columns());
         let mut state = saved.state.clone();
         if columns == 0 {

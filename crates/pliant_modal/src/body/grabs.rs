@@ -30,7 +30,7 @@ impl Body {
         self.next_grab += 1;
         let hold = Hold::Target { target, velocity: Vector3::zeros(), config };
         self.hands.push(Hand::new(Arc::new(patch), hold));
-        self.grabs.push(GrabEntry { id, target, last_target: None, config });
+        self.grabs.push(GrabEntry { id, target, last_target: None, slip: Vector3::zeros(), config });
         self.kernel.prepare(&self.hands);
         Ok(id)
     }
@@ -53,11 +53,24 @@ impl Body {
     ///
     /// The shapes go when the last grab is released, and when the elasticity becomes linear.
     ///
+    /// Under the same forces, the held patches are elsewhere with other shapes. The hands follow by
+    /// as much, and come back to their targets within a second. What they feel goes over to the new
+    /// force as smoothly.
+    ///
     /// # Errors
     /// Returns [`StepError::OtherModel`] for shapes of another model. The old ones then stay.
     pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) -> Result<(), StepError> {
+        let points = |body: &Self| -> Vec<Vector3<f64>> {
+            body.hands.iter().map(|hand| body.kernel.hand_point(hand, &body.state)).collect()
+        };
+        let before = points(self);
         self.kernel.set_held_shapes(shapes, &mut self.state, &self.hands)?;
         self.kernel.prepare(&self.hands);
+        let (after, frame) = (points(self), self.state.frame);
+        for ((grab, before), after) in self.grabs.iter_mut().zip(before).zip(after) {
+            let slip = grab.slip + frame.rotation() * (after - before);
+            grab.slip = if slip.norm() <= self.kernel.model().size() { slip } else { Vector3::zeros() };
+        }
         Ok(())
     }
 

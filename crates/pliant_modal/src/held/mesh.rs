@@ -39,7 +39,11 @@ impl SimulationMesh {
     pub const STEPS: f32 = 32_767.0;
 
     /// Maximum number of tetrahedra of a simulation mesh in a model.
-    pub const MAX_TETS: usize = 32_768;
+    pub const MAX_TETS: usize = 65_536;
+
+    /// Maximum number of [`SimulationMesh::displacements`] with which a bake puts the mesh into a
+    /// model: 16 MiB, those of 36 coordinates at 77,000 nodes.
+    pub const MAX_DISPLACEMENTS: usize = 8 << 20;
 
     /// Returns the scales and the displacements for values `[node][axis][coordinate]`, kg^-1/2.
     pub fn quantized(values: &[f64], coordinates: usize) -> (Vec<f32>, Vec<i16>) {

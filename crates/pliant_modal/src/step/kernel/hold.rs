@@ -27,6 +27,15 @@ fn turned(
 }
 
 impl Kernel {
+    /// Where a state has the point of a patch that the hand holds under the force of the last step,
+    /// as a displacement from rest, m, body axes. The hand's own spring counts too.
+    pub(crate) fn hand_point(&self, hand: &Hand, state: &State) -> Vector3<f64> {
+        let own = self.held_shapes().map(|shapes| shapes.displacement(&hand.patch, &state.s));
+        let modal = hand.patch.displacement(&state.q, self.warps());
+        let force = state.frame.rotation().inverse() * hand.mean;
+        modal + own.unwrap_or_default() + self.compliance(hand, &state.q) * force
+    }
+
     /// Compliance of a hand within one step besides the modes, 3x3, m/N, body axes.
     ///
     /// It is the residual flexibility of the patch plus the compliance of the hand's own spring.
