@@ -13,13 +13,14 @@ const ALL: &str = "all";
 #[derive(Args, Debug)]
 pub(crate) struct ReportArgs {
     /// Only one part: elements, modes, steps, warp, precision, frames, network, front, elasticity,
-    /// table-2, table-3, courses, default
+    /// table-2, table-2-repair, table-3, courses, default
     #[arg(long, default_value = ALL)]
     only: String,
     /// Fewer points and shorter timings: within ten minutes on two cores
     #[arg(long)]
     quick: bool,
-    /// Folder of the surfaces bunny.obj and armadillo.obj, which are measured if they exist
+    /// Folder of the surfaces bunny.obj and armadillo.obj; the own body stands in for one that is
+    /// missing
     #[arg(long, value_name = "DIR", default_value = "../shared/models")]
     models: PathBuf,
     /// The project's own body: a surface or a scene

@@ -15,7 +15,8 @@ use pliant_modal::{Body, BodyConfig, Elasticity, Integrator, ModalModel, Relaxat
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::peer::PeerSessionConfig;
 use pliant_stream::{
-    BodyId, GuestSessionConfig, HostSessionConfig, Newmark, PeerId, RecoveryConfig, RepairCounts, StreamError,
+    BodyId, GuestSessionConfig, HostSessionConfig, Newmark, PeerId, Policy, RecoveryConfig, RepairCounts,
+    StreamError,
 };
 
 use crate::pair::{Pair, PathConfig};
@@ -39,7 +40,7 @@ pub struct Experiment {
     pub rate: f64,
     /// Measured time after the guest has joined, s. Default: 30.
     pub seconds: f64,
-    /// Seed of the links. Default: 1.
+    /// Seed of the links. Default: [`Experiment::SEED`].
     pub seed: u64,
     /// Number of streamed modes. Default: all.
     pub modes: Option<u16>,
@@ -205,6 +206,9 @@ pub struct TrackPoint {
 }
 
 impl Experiment {
+    /// The seed of an experiment that names no other.
+    pub const SEED: u64 = 1;
+
     /// An experiment with a path that is the same both ways and defaults for everything else.
     pub fn new(model: Arc<ModalModel>, link: LinkConfig, recovery: RecoveryConfig) -> Self {
         Self {
@@ -215,13 +219,13 @@ impl Experiment {
             up: link,
             rate: 40.0,
             seconds: 30.0,
-            seed: 1,
+            seed: Self::SEED,
             modes: None,
             elasticity: Elasticity::Linear,
             held_shapes: false,
             integrator: recovery.integrator(),
             relaxation: None,
-            newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
+            newmark: Self::our_newmark(40.0),
             resend_after: Duration::ZERO,
             warmup: Duration::from_secs(2),
             quantum: HostSessionConfig::default().quantum,
@@ -230,6 +234,27 @@ impl Experiment {
             guest_hand: false,
             keep_track: false,
         }
+    }
+
+    /// Gives a stream of accelerations the paper's integrator at both ends, average acceleration:
+    /// the host steps by it, and guests read accelerations by it. A stream of forces keeps its own.
+    pub fn use_the_papers_integrator(&mut self) {
+        if !matches!(self.recovery.policy, Policy::ForceDriven { .. }) {
+            self.integrator = Integrator::Newmark;
+            self.newmark = Newmark::average(1.0 / self.rate);
+        }
+    }
+
+    /// Gives the host the integrator that the library has for its policy, and guests the filter of
+    /// it: what an experiment has from the beginning.
+    pub fn use_our_integrator(&mut self) {
+        self.integrator = self.recovery.integrator();
+        self.newmark = Self::our_newmark(self.rate);
+    }
+
+    /// The filter by which guests read accelerations of generalized-alpha with `rho_inf` 0.5.
+    fn our_newmark(rate: f64) -> Newmark {
+        Newmark { h: 1.0 / rate, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 }
     }
 
     /// How the body is stepped.

@@ -2,15 +2,15 @@
 
 use std::{fmt::Write, sync::Arc, time::Duration};
 
-use pliant_modal::{Integrator, ModalModel};
+use pliant_modal::ModalModel;
 use pliant_stream::{
-    Newmark, Policy, Predict, RecoveryConfig,
+    Predict, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
     wire::AccelerationCoding,
 };
 
 use super::{
-    plot::{Figure, Series},
+    plot::{Axes, Figure, Series},
     tables::body,
 };
 use crate::{
@@ -25,20 +25,10 @@ const LATE: u16 = 50;
 /// Values beyond this share of the largest true value are drawn at it, %.
 const DRAWN: f64 = 150.0;
 
-/// What a figure draws of a line.
-#[derive(Clone, Copy, PartialEq)]
-enum Draw {
-    /// What was shown.
-    Shown,
-    /// What was shown less the true value.
-    Error,
-}
-
-/// A figure of the paper: its number, its title, and lines that are drawn in the same way.
+/// A figure of the paper: its number, its title and its lines.
 struct Course {
     number: u8,
     title: &'static str,
-    draw: Draw,
     lines: Vec<(String, Metrics)>,
     /// What is the same as in the paper, and what is not.
     words: &'static str,
@@ -70,10 +60,7 @@ fn run(
 ) -> Result<Metrics, LabError> {
     recovery.coding = AccelerationCoding::F64;
     let mut e = Experiment::new(model.clone(), link, recovery);
-    if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
-        e.integrator = Integrator::Newmark;
-        e.newmark = Newmark::average(STEP);
-    }
+    e.use_the_papers_integrator();
     e.resend_after = Duration::from_secs_f64(f64::from(late) * STEP);
     (e.seconds, e.keep_track) = (18.5, true);
     e.hands.iter_mut().for_each(|h| h.tremor = 0.0);
@@ -127,28 +114,24 @@ pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
         Course {
             number: 6,
             title: "the four networks",
-            draw: Draw::Shown,
             lines: networks,
             words: "The losses and bandwidths of the four networks are those of the paper, and so is the round trip of the first. The paper gives the other three round trips only in a figure, so 120, 60 and 20 ms are assumed. Our networks are emulated. NACKs are answered at once.",
         },
         Course {
             number: 7,
             title: "with and without prediction and compensation",
-            draw: Draw::Shown,
             lines: prediction,
             words: "Lost accelerations are predicted by the paper's line through the last two, or counted as zero, and are compensated over 50 ticks when they arrive, or never. The losses are the 22 at random of figure 8.",
         },
         Course {
             number: 8,
             title: "compensation in 1 and in 50 steps",
-            draw: Draw::Error,
             lines: compensation,
             words: "The paper's case: 22 ticks are lost at random from tick 135, and are compensated in 1 or in 50 steps, about 50 ticks later. The ticks themselves are ours, as the paper does not list them. The lines that are answered at once are not in the paper.",
         },
         Course {
             number: 9,
             title: "random, burst and pattern",
-            draw: Draw::Error,
             lines: kinds,
             words: "The paper's three cases: 22 ticks lost at random from tick 135, 12 in a row from tick 140, and one in 50 from tick 135, 11 in all. They are compensated in 50 steps, 50 ticks later.",
         },
@@ -156,36 +139,37 @@ pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
     Ok(all.iter().flat_map(|course| [figure(course, false), figure(course, true)]).collect())
 }
 
-/// A figure of the displacement at the hand, or of its force.
+/// A figure of the displacement at the hand, or of its force: what was shown, and below it what was
+/// shown less the true value.
 fn figure(course: &Course, force: bool) -> Figure {
     let pair = |t: &TrackPoint| if force { t.reaction } else { t.displacement };
     let largest = course.lines.iter().flat_map(|(_, f)| &f.track).map(|t| pair(t)[0].abs());
     let largest = largest.fold(1e-12, f64::max);
-    let value = |t: &TrackPoint| {
-        let [real, shown] = pair(t);
-        let value = if course.draw == Draw::Shown { shown } else { shown - real };
-        (100.0 * value / largest).clamp(-DRAWN, DRAWN)
-    };
-    let mut series = Vec::new();
+    let share = |value: f64| (100.0 * value / largest).clamp(-DRAWN, DRAWN);
+    let real = |t: &TrackPoint| share(pair(t)[0]);
+    let shown = |t: &TrackPoint| share(pair(t)[1]);
+    let off = |t: &TrackPoint| 100.0 * (pair(t)[1] - pair(t)[0]) / largest;
     // The hands move by the host's clock, and a guest joins later where the path is longer.
     let first = course.lines.iter().filter_map(|(_, f)| Some(f.track.first()?.tick)).min().unwrap_or(0);
     let points = |f: &Metrics, value: &dyn Fn(&TrackPoint) -> f64| {
         f.track.iter().map(|t| ((t.tick - first) as f64, value(t))).collect::<Vec<_>>()
     };
-    // All hosts of a figure move alike, so one true line stands for all.
-    if course.draw == Draw::Shown
-        && let Some((_, f)) = course.lines.first()
-    {
-        let real = |t: &TrackPoint| 100.0 * pair(t)[0] / largest;
-        series.push(Series::new("true", points(f, &real)));
-    }
-    series.extend(course.lines.iter().map(|(name, f)| Series::new(name.clone(), points(f, &value))));
+    // All of the paper's hosts move alike, so that one true line stands for all: the one that begins
+    // first. The default's host has another integrator.
+    let earliest = course
+        .lines
+        .iter()
+        .min_by_key(|(name, f)| (name.starts_with("default"), f.track.first().map_or(u64::MAX, |t| t.tick)));
+    let truth = earliest.map(|(_, f)| Series::new("true", points(f, &real)).broad());
+    let lines = |of: &dyn Fn(&TrackPoint) -> f64| {
+        course.lines.iter().map(|(name, f)| Series::new(name.clone(), points(f, of))).collect::<Vec<_>>()
+    };
     let what = if force { "force" } else { "shape" };
     let mut words = format!("{} ", course.words);
     if force {
-        words.push_str("The figure shows the force on the first hand along its largest reach.");
+        words.push_str("The figure shows the force on the first hand along its largest reach, and below it, for each line with its own scale, what was shown less what was true. Lines that hide each other above agree. *True* is of the paper's host; that of the default has the exact step and moves a little otherwise, and each line is compared with its own host.");
     } else {
-        words.push_str("The figure shows the displacement at the first hand along its largest reach. What is not as in the paper: the body (a bar of 60 modes), the paths of the hands (two that circle slowly), and the frames (plain numbers, but in our datagrams).\n\n| line | largest error of the shape at the hand % | anywhere % | at the end % | shape, rms / rms of the motion % | largest error of the force at the hand % | force, rms / rms of the force % |\n| --- | --- | --- | --- | --- | --- | --- |\n");
+        words.push_str("The figure shows the displacement at the first hand along its largest reach, and below it, for each line with its own scale, what was shown less what was true. Lines that hide each other above agree. *True* is of the paper's host; that of the default has the exact step and moves a little otherwise, and each line is compared with its own host. What is not as in the paper: the body (a bar of 60 modes), the paths of the hands (two that circle slowly), and the frames (plain numbers, but in our datagrams). *Anywhere* is at some 48 vertices of the surface.\n\n| line | largest error of the shape at the hand % | anywhere % | at the end % | shape, rms / rms of the motion % | largest error of the force at the hand % | force, rms / rms of the force % |\n| --- | --- | --- | --- | --- | --- | --- |\n");
         for (name, f) in &course.lines {
             let most = |of: &dyn Fn(&TrackPoint) -> [f64; 2]| {
                 let all = f.track.iter().map(of);
@@ -205,19 +189,29 @@ fn figure(course: &Course, force: bool) -> Figure {
             );
         }
     }
-    let beyond = course.lines.iter().flat_map(|(_, f)| &f.track).any(|t| value(t).abs() >= DRAWN);
-    if beyond {
-        let _ = write!(words, "\n\nValues beyond {DRAWN:.0} % are drawn at {DRAWN:.0} %.");
+    if course.lines.iter().flat_map(|(_, f)| &f.track).any(|t| shown(t).abs() >= DRAWN) {
+        let _ = write!(words, "\n\nAbove, values beyond {DRAWN:.0} % are drawn at {DRAWN:.0} %.");
     }
-    let drawn = if course.draw == Draw::Shown { "shown" } else { "shown - true" };
-    Figure {
-        file: format!("paper-{}-{what}", course.number),
-        title: format!("Paper's figure {}, {what}: {}", course.number, course.title),
+    let unit = format!("% of the largest {}", if force { "force" } else { "displacement" });
+    let drawn = |file: String, title: String, y: &str, series| Figure {
+        file,
+        title,
         x: "tick".into(),
-        y: format!("{drawn} at the hand, % of the largest {}", if force { "force" } else { "displacement" }),
-        logarithmic: false,
+        y: format!("{y}, {unit}"),
+        axes: Axes::Linear,
         series,
         reference_error: None,
-        words,
-    }
+        words: String::new(),
+        below: None,
+    };
+    let file = format!("paper-{}-{what}", course.number);
+    let title = format!("Paper's figure {}, {what}: {}", course.number, course.title);
+    let error = drawn(
+        format!("{file}-error"),
+        format!("What was shown less what was true, {unit}, each with its own scale"),
+        "shown - true",
+        lines(&off),
+    );
+    let series = truth.into_iter().chain(lines(&shown)).collect();
+    Figure { words, below: Some(Box::new(error)), ..drawn(file, title, "shown at the hand", series) }
 }

@@ -20,8 +20,8 @@ use std::{
 
 use serde::Serialize;
 
-use crate::{LabError, machine, progress::Progress};
-use plot::Figure;
+use crate::{LabError, experiment::Experiment, machine, progress::Progress};
+use plot::{Axes, Figure};
 
 /// A part of the report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,6 +46,8 @@ pub enum Part {
     Elasticity,
     /// The paper's table 2.
     Table2,
+    /// The paper's table 2 with compensation and without.
+    Table2Repair,
     /// The paper's networks and the data sent over them.
     Table3,
     /// The paper's figures 6 to 9.
@@ -56,7 +58,7 @@ pub enum Part {
 
 impl Part {
     /// All parts, in the order of the report.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::Elements,
         Self::Modes,
         Self::Steps,
@@ -67,6 +69,7 @@ impl Part {
         Self::Front,
         Self::Elasticity,
         Self::Table2,
+        Self::Table2Repair,
         Self::Table3,
         Self::Courses,
         Self::Default,
@@ -85,6 +88,7 @@ impl Part {
             Self::Front => "front",
             Self::Elasticity => "elasticity",
             Self::Table2 => "table-2",
+            Self::Table2Repair => "table-2-repair",
             Self::Table3 => "table-3",
             Self::Courses => "courses",
             Self::Default => "default",
@@ -108,6 +112,7 @@ impl Part {
             Self::Front => "g. All together",
             Self::Elasticity => "h. Elasticity",
             Self::Table2 => "The paper's table 2",
+            Self::Table2Repair => "The paper's table 2 with compensation",
             Self::Table3 => "The paper's networks and what crosses them (its table 3)",
             Self::Courses => "The paper's figures 6, 7, 8 and 9",
             Self::Default => "The default at run time, in words",
@@ -122,7 +127,8 @@ pub struct ReportSettings {
     pub parts: Vec<Part>,
     /// Use fewer points and shorter timings.
     pub quick: bool,
-    /// Folder of the surfaces bunny.obj and armadillo.obj, which are measured if they exist.
+    /// Folder of the surfaces bunny.obj and armadillo.obj. The project's own body stands in for one
+    /// that is not there.
     pub models: PathBuf,
     /// The project's own body: a surface or a scene.
     pub own: PathBuf,
@@ -149,7 +155,8 @@ pub struct Report {
 }
 
 /// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder. The folder
-/// is created if it does not exist.
+/// is created if it does not exist. Of a `report.md` that is there already, the parts that are not
+/// measured now stay as they are.
 ///
 /// # Errors
 /// Returns [`LabError::Write`] or [`LabError::Plot`] for files, and the other errors for
@@ -161,15 +168,15 @@ pub fn write(
 ) -> Result<Report, LabError> {
     std::fs::create_dir_all(folder)?;
     let began = Instant::now();
-    let mut text = heading();
-    let load = machine::load();
+    let page = folder.join("report.md");
+    let mut made = Vec::new();
     let mut report = Report { parts: Vec::new(), seconds: 0.0 };
     for &part in &settings.parts {
         progress.report(part.name(), 0.0);
-        let start = Instant::now();
+        let (start, load) = (Instant::now(), machine::load());
         let (figures, words) = measure(part, settings, progress)?;
         let mut files = Vec::new();
-        let _ = writeln!(text, "\n## {}\n", part.title());
+        let mut text = String::new();
         for figure in &figures {
             plot::write(folder, figure)?;
             let _ = writeln!(text, "![{}]({}.svg)\n\n{}", figure.title, figure.file, figure.words);
@@ -177,21 +184,48 @@ pub fn write(
                 let _ = writeln!(text, "The error of the reference is about {error:.1e}.");
             }
             let _ = writeln!(text, "\n{}", rows(figure));
-            files.extend(["csv", "svg", "png"].map(|e| format!("{}.{e}", figure.file)));
+            files.extend(figure.files());
         }
-        let _ = writeln!(text, "{words}");
-        report.parts.push(Written { name: part.name(), files, seconds: start.elapsed().as_secs_f64() });
+        let seconds = start.elapsed().as_secs_f64();
+        let text = format!("{}\n\n{text}{words}", stamp(part, settings.quick, seconds, load));
+        made.push(Section { part, text });
+        report.parts.push(Written { name: part.name(), files, seconds });
     }
     report.seconds = began.elapsed().as_secs_f64();
-    let _ = writeln!(
-        text,
-        "\nMade in {:.0} s by `pliant report{}`. {}",
-        report.seconds,
-        if settings.quick { " --quick" } else { "" },
-        quiet(load, machine::load()),
-    );
-    std::fs::write(folder.join("report.md"), text)?;
+    // Read at the end, so that another run may have written its part meanwhile.
+    let mut sections = match std::fs::read_to_string(&page) {
+        Ok(text) => Section::all(&text),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Vec::new(),
+        Err(error) => return Err(error.into()),
+    };
+    sections.retain(|section| made.iter().all(|made| made.part != section.part));
+    sections.append(&mut made);
+    let mut text = HEADING.to_owned();
+    for part in Part::ALL {
+        for section in sections.iter().filter(|section| section.part == part) {
+            let _ = write!(text, "\n## {}\n\n{}\n", part.title(), section.text.trim_end());
+        }
+    }
+    std::fs::write(page, text)?;
     Ok(report)
+}
+
+/// A part's text in `report.md`, without its title.
+struct Section {
+    part: Part,
+    text: String,
+}
+
+impl Section {
+    /// The parts of a page. What has another title is not kept.
+    fn all(page: &str) -> Vec<Self> {
+        let named = |section: &str| {
+            let (title, text) = section.split_once('\n')?;
+            let part = Part::ALL.into_iter().find(|part| part.title() == title.trim())?;
+            Some(Self { part, text: text.trim().to_owned() })
+        };
+        page.split("\n## ").skip(1).filter_map(named).collect()
+    }
 }
 
 fn measure(
@@ -212,6 +246,9 @@ fn measure(
         Part::Front => front::all_together(quick, progress)?,
         Part::Elasticity => elasticity::elasticity(quick)?,
         Part::Table2 => (Vec::new(), tables::table_2(models, own, if quick { 0.3 } else { 2.0 }, progress)?),
+        Part::Table2Repair => {
+            (Vec::new(), tables::table_2_repair(models, own, if quick { 2.0 } else { 10.0 }, progress)?)
+        }
         Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
         Part::Courses => (courses::courses()?, String::new()),
         Part::Default => {
@@ -222,7 +259,7 @@ fn measure(
 }
 
 fn rows(figure: &Figure) -> String {
-    if !figure.logarithmic {
+    if figure.axes == Axes::Linear || figure.series.iter().all(|series| series.scattered) {
         return String::new();
     }
     let timed = figure.series.iter().any(|series| !series.late.is_empty());
@@ -239,22 +276,23 @@ fn rows(figure: &Figure) -> String {
     out
 }
 
-/// A sentence about the other load on the machine, if the system reports it.
-fn quiet(before: Option<f64>, after: Option<f64>) -> String {
-    let (Some(before), Some(after)) = (before, after) else { return String::new() };
-    format!(
-        "The load of the machine (runnable programs, mean over a minute) was {before:.1} at the start and {after:.1} at the end. The report itself counts as one program, and bakes use all cores. If the load is higher than that, the times are too long, and only ratios within a run are meaningful."
-    )
-}
+const HEADING: &str = "# Cost and accuracy of Pliant\n\nEach part says by which command it was made, when, and on which machine. Unless stated otherwise, times are those of one thread that is pinned to one core. They are medians after a warm-up, with the 99th percentile beside them (whiskers in the figures). The load of a machine is the mean number of runnable programs over a minute. The report itself counts as one, and bakes use all cores. If the load is higher than that, the times are too long, and only ratios within a part are meaningful.\n";
 
-fn heading() -> String {
+/// A line that says how a part was made.
+fn stamp(part: Part, quick: bool, seconds: f64, load: Option<f64>) -> String {
     let days = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)
         .map_or(0, |since| since.as_secs() / 86_400);
     let [y, m, d] = date(days as i64);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let load = match (load, machine::load()) {
+        (Some(before), Some(after)) => format!(" Load {before:.1} at the start and {after:.1} at the end."),
+        _ => String::new(),
+    };
     format!(
-        "# Cost and accuracy of Pliant\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores{}, {} {}, {}. Unless stated otherwise, times are those of one thread that is pinned to one core. They are medians after a warm-up, with the 99th percentile beside them (whiskers in the figures).\n",
+        "*Made on {y:04}-{m:02}-{d:02} in {seconds:.0} s by `pliant report --only {}{}`: Pliant {}, {cores} cores{}, {} {}, {}. What is random has the seed {}.{load}{}*",
+        part.name(),
+        if quick { " --quick" } else { "" },
         env!("CARGO_PKG_VERSION"),
         match machine::processor() {
             name if name.is_empty() => name,
@@ -263,6 +301,8 @@ fn heading() -> String {
         std::env::consts::ARCH,
         std::env::consts::OS,
         vectors(),
+        Experiment::SEED,
+        if cfg!(debug_assertions) { " A build that checks itself, so that times are too long." } else { "" },
     )
 }
 
@@ -296,12 +336,24 @@ fn date(days: i64) -> [i64; 3] {
 
 #[cfg(test)]
 mod tests {
-    use super::Part;
+    use super::{Part, Section};
 
     #[test]
     fn every_part_is_found_by_its_own_name() {
         Part::ALL.iter().for_each(|part| assert_eq!(Part::by_name(part.name()), Some(*part)));
         assert_eq!(Part::by_name("all"), None);
+    }
+
+    #[test]
+    fn parts_of_a_page_are_found_and_others_are_not_kept() {
+        let [first, second] = [Part::Network, Part::Table2];
+        let page = format!(
+            "# Report\n\nwords\n\n## {}\n\none\n\n### not a part\n\n## Another\n\ntwo\n\n## {}\n\nthree\n",
+            second.title(),
+            first.title()
+        );
+        let found: Vec<_> = Section::all(&page).into_iter().map(|s| (s.part, s.text)).collect();
+        assert_eq!(found, [(second, "one\n\n### not a part".to_owned()), (first, "three".to_owned())]);
     }
 
     #[test]

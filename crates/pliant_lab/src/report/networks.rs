@@ -2,15 +2,15 @@
 
 use std::{fmt::Write, sync::Arc, time::Duration};
 
-use pliant_modal::{Integrator, ModalModel};
+use pliant_modal::ModalModel;
 use pliant_stream::{
-    Newmark, Playout, Policy, Predict, RecoveryConfig,
+    Playout, Predict, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
     peer::LateInputRepair,
 };
 
 use super::{
-    plot::{Figure, Series},
+    plot::{Axes, Figure, Series},
     tables::body,
 };
 use crate::{
@@ -53,24 +53,58 @@ fn schemes() -> Vec<RepairScheme> {
     ]
 }
 
-/// The paper's four networks, and its worst one with jitter and with bursts.
-fn paths() -> Vec<(&'static str, LinkConfig)> {
-    let worst = || LinkConfig::preset(Preset::Paper1);
-    let jitter = |ms| LinkConfig { jitter: Duration::from_millis(ms), ..worst() };
-    let bursts = |mean| {
-        let loss = Loss::gilbert(0.09, mean, Duration::from_secs_f64(STEP));
-        LinkConfig { loss, ..worst() }
-    };
-    vec![
-        ("paper-1", worst()),
-        ("paper-2", LinkConfig::preset(Preset::Paper2)),
-        ("paper-3", LinkConfig::preset(Preset::Paper3)),
-        ("paper-4", LinkConfig::preset(Preset::Paper4)),
-        ("paper-1, jitter 10 ms", jitter(10)),
-        ("paper-1, jitter 30 ms", jitter(30)),
-        ("paper-1, bursts of 4", bursts(4.0)),
-        ("paper-1, bursts of 12", bursts(12.0)),
-    ]
+/// Jitters (ms) and mean lengths of bursts (ticks) that each of the paper's networks gets.
+const JITTERS: [u64; 2] = [10, 30];
+const BURSTS: [f64; 2] = [4.0, 12.0];
+
+/// An emulated path.
+struct Path {
+    name: String,
+    link: LinkConfig,
+    /// Loss of the paper's network as it is, %: the axis of a figure.
+    loss: Option<f64>,
+    /// Jitter, ms, and mean length of a burst, ticks, where the worst network has them: the axes of
+    /// two figures.
+    jitter: Option<f64>,
+    burst: Option<f64>,
+    /// Whether each way's best settings are searched for here: on the four networks as they are,
+    /// and on the worst one with jitter and bursts.
+    search: bool,
+}
+
+/// The paper's four networks, and then each of them with jitter and, if it loses anything, with
+/// bursts; the short form has only the worst one with them.
+fn paths(quick: bool) -> Vec<Path> {
+    let mut all = Vec::new();
+    let networks = [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4];
+    for preset in networks {
+        let worst = preset == Preset::Paper1;
+        let (jitter, burst) = (worst.then_some(0.0), worst.then_some(1.0));
+        let (name, link) = (preset.name().into(), LinkConfig::preset(preset));
+        let loss = Some(match link.loss {
+            Loss::Random(lost) => 100.0 * lost,
+            _ => 0.0,
+        });
+        all.push(Path { name, link, loss, jitter, burst, search: true });
+    }
+    for preset in networks.into_iter().filter(|preset| !quick || *preset == Preset::Paper1) {
+        let worst = preset == Preset::Paper1;
+        for ms in JITTERS {
+            let link = LinkConfig { jitter: Duration::from_millis(ms), ..LinkConfig::preset(preset) };
+            let name = format!("{}, jitter {ms} ms", preset.name());
+            let jitter = worst.then_some(ms as f64);
+            all.push(Path { name, link, loss: None, jitter, burst: None, search: worst });
+        }
+        let Loss::Random(lost) = LinkConfig::preset(preset).loss else { continue };
+        for mean in BURSTS {
+            let loss = Loss::gilbert(lost, mean, Duration::from_secs_f64(STEP));
+            let link = LinkConfig { loss, ..LinkConfig::preset(preset) };
+            let name = format!("{}, bursts of {mean:.0}", preset.name());
+            let burst = worst.then_some(mean);
+            all.push(Path { name, link, loss: None, jitter: None, burst, search: worst });
+        }
+    }
+    all
 }
 
 /// A way of repair over a path with a playout delay (ticks) and repeats.
@@ -84,11 +118,7 @@ fn experiment(
     let recovery = RecoveryConfig { playout: Playout::Fixed(delay), repeats, ..scheme.recovery };
     let mut made = Experiment::new(model.clone(), link.clone(), recovery);
     made.peer_repeats = repeats.into();
-    // The paper's streams have the paper's integrator at both ends.
-    if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
-        made.integrator = Integrator::Newmark;
-        made.newmark = Newmark::average(STEP);
-    }
+    made.use_the_papers_integrator();
     made.seconds = seconds;
     made
 }
@@ -112,7 +142,24 @@ fn timed(scheme: &RepairScheme, mut made: Experiment) -> Result<Metrics, LabErro
     Ok(f)
 }
 
-const COLUMNS: &str = "| network | repair | playout ticks, repeats | rms % | rms / rms of the motion % | largest % | ticks missing | force, rms / rms of the force % | without tremor: force % | shown delay ms | kbit/s | processor us a tick |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n";
+/// The least and the largest error of the shape, % of the motion, with the seed of the experiment
+/// and the next ones, `seeds` in all.
+fn spread(
+    scheme: &RepairScheme,
+    made: &Experiment,
+    first: &Metrics,
+    seeds: u64,
+) -> Result<[f64; 2], LabError> {
+    let mut both = [first.rms_of_motion_percent; 2];
+    for more in 1..seeds {
+        let made = Experiment { seed: made.seed + more, ..made.clone() };
+        let error = run(scheme, &made)?.rms_of_motion_percent;
+        both = [both[0].min(error), both[1].max(error)];
+    }
+    Ok(both)
+}
+
+const COLUMNS: &str = "| network | repair | playout ticks, repeats | rms % | rms / rms of the motion % | largest % | ticks missing | force, rms / rms of the force % | without tremor: rms / rms of the motion % | without tremor: force % | shown delay ms | kbit/s | processor us a tick | rms / rms of the motion of several seeds, least % | most % |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n";
 
 fn row(
     out: &mut String,
@@ -121,6 +168,7 @@ fn row(
     (delay, repeats): (u8, u8),
     f: &Metrics,
     calm: &Metrics,
+    [least, most]: [f64; 2],
 ) {
     let settings = match scheme.between_peers {
         Some(_) => format!("0, {repeats}"),
@@ -129,13 +177,14 @@ fn row(
     // Writing to a string cannot fail.
     let _ = writeln!(
         out,
-        "| {path} | {} | {settings} | {:.4} | {:.4} | {:.2} | {} | {:.4} | {:.4} | {:.0} | {:.1} | {:.1} |",
+        "| {path} | {} | {settings} | {:.4} | {:.4} | {:.2} | {} | {:.4} | {:.4} | {:.4} | {:.0} | {:.1} | {:.1} | {least:.4} | {most:.4} |",
         scheme.name,
         f.rms_percent,
         f.rms_of_motion_percent,
         f.max_percent,
         f.missing,
         f.force_rms_of_force_percent,
+        calm.rms_of_motion_percent,
         calm.force_rms_of_force_percent,
         f.visual_delay_ms,
         f.kbit_s,
@@ -150,30 +199,38 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
     // Pin the thread after the bake, whose threads would otherwise stay on this core. The thread's
     // own clock leaves out other load on the machine.
     let _pinned = Pinned::new();
-    let seconds = if quick { 20.0 } else { 60.0 };
-    let (schemes, paths) = (schemes(), paths());
+    let (seconds, seeds) = if quick { (20.0, 2) } else { (60.0, 6) };
+    let (schemes, paths) = (schemes(), paths(quick));
     let (mut equal, mut best) = (COLUMNS.to_owned(), COLUMNS.to_owned());
-    let mut points = vec![[Vec::new(), Vec::new()]; schemes.len()];
+    let mut points = vec![[const { Vec::new() }; 4]; schemes.len()];
     let without_tremor = |mut made: Experiment| {
         made.hands.iter_mut().for_each(|hand| hand.tremor = 0.0);
         made
     };
     let (delays, repeats): (&[u8], &[u8]) =
         if quick { (&[1, 4], &[3]) } else { (&[0, 1, 2, 4], &[0, 1, 3, 7]) };
-    for (done, (path, link)) in paths.iter().enumerate() {
+    for (done, Path { name: path, link, loss, jitter, burst, search }) in paths.iter().enumerate() {
         for (index, scheme) in schemes.iter().enumerate() {
             progress.report(
                 "network",
                 (done * schemes.len() + index) as f64 / (paths.len() * schemes.len()) as f64,
             );
             let made = |settings| experiment(&model, scheme, link, settings, seconds);
-            let f = timed(scheme, made(EQUAL))?;
-            row(&mut equal, path, scheme, EQUAL, &f, &run(scheme, &without_tremor(made(EQUAL)))?);
-            // The first four paths are the paper's networks, which are drawn.
-            if done < 4 {
-                let error = f.rms_of_motion_percent.max(1e-5);
-                points[index][0].push((f.kbit_s, error));
-                points[index][1].push((f.cpu_us_per_tick, error));
+            let measured = |out: &mut String, settings| -> Result<Metrics, LabError> {
+                let f = timed(scheme, made(settings))?;
+                let calm = run(scheme, &without_tremor(made(settings)))?;
+                let spread = spread(scheme, &made(settings), &f, seeds)?;
+                row(out, path, scheme, settings, &f, &calm, spread);
+                Ok(f)
+            };
+            let f = measured(&mut equal, EQUAL)?;
+            let error = f.rms_of_motion_percent.max(1e-5);
+            let at = [*loss, loss.map(|_| f.cpu_us_per_tick), *jitter, *burst];
+            for (points, x) in points[index].iter_mut().zip(at) {
+                points.extend(x.map(|x| (x, error)));
+            }
+            if !search {
+                continue;
             }
             let mut least = (f64::INFINITY, EQUAL);
             let own_delay = if scheme.between_peers.is_some() { &delays[..1] } else { delays };
@@ -186,38 +243,52 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
                     }
                 }
             }
-            let f = timed(scheme, made(least.1))?;
-            row(&mut best, path, scheme, least.1, &f, &run(scheme, &without_tremor(made(least.1)))?);
+            measured(&mut best, least.1)?;
         }
     }
     let text = format!(
         "All ways with a playout delay of {} tick and {} repeats (peers have no playout delay):\n\n{equal}\n\
-         Each way with the playout delay ({}) and the repeats ({}) that give it the smallest error of the shape over this network, smaller ones where that costs less than a hundredth:\n\n{best}\n\
-         *rms* and *largest* are shares of the largest displacement, *rms / rms of the motion* is the error as a share of the rms of the true displacement, and so for the force. The true shape has all modes. A tick that is not shown in time counts with the picture and the forces that are shown instead, and a force that is not shown counts as zero. The hands have a tremor of 9.3 and 11.7 Hz, which nothing can predict; one column is without it. The *shown delay* is from the host's step to the showing of its tick. Peers show their own step at once, before they know all targets, and are compared with what all agree on under rollback; so is compensation, which leaves each peer with a state of its own. `none` and the paper's policies stream accelerations, with average acceleration at both ends as in the paper. Bursts are those of a Gilbert-Elliott path with 9 % loss.\n",
+         Each way with the playout delay ({}) and the repeats ({}) that give it the smallest error of the shape over this network, smaller ones where that costs less than a hundredth. They were searched for on the paper's networks, and on the worst one with jitter and bursts:\n\n{best}\n\
+         *rms* and *largest* are shares of the largest displacement, *rms / rms of the motion* is the error as a share of the rms of the true displacement, and so for the force. The true shape has all modes, and shapes are compared at some 48 vertices of the surface. A tick that is not shown in time counts with the picture and the forces that are shown instead, and a force that is not shown counts as zero. The hands have a tremor of 9.3 and 11.7 Hz, which nothing can predict; two columns are without it. The *shown delay* is from the host's step to the showing of its tick. Peers show their own step at once, before they know all targets, and are compared with what all agree on under rollback; so is compensation, which leaves each peer with a state of its own. `none` and the paper's policies stream accelerations, with average acceleration at both ends as in the paper. Jitter is an extra delay with an exponential distribution of this mean, and may change the order. Bursts are those of a Gilbert-Elliott path that loses as much as the network does; the last network loses nothing and has none. Each run is {seconds:.0} s of a session of two hands at the host, between peers one at each. The last two columns are of {seeds} seeds of the network, the first of which is that of all other columns.\n",
         EQUAL.0,
         EQUAL.1,
         list(delays),
         list(repeats),
     );
-    let words = "Each line is a way of repair, and its points are the paper's four networks (9, 6, 3 and 0 % loss). Lower and further left is better. All have the same playout delay of one tick and the same three repeats, but peers have no playout delay.";
-    let time = "The figure shows the same error over the processor time of a tick at the receiver. The time includes decoding, correcting and stepping 60 modes, and between peers also the peer's own hands. It is the time of the thread itself on one core, the shortest of three runs.";
+    let words = "Each line is a way of repair, over the loss of the paper's four networks, whose round trips differ, too (196, 120, 60 and 20 ms from the worst to the best). All have the same playout delay of one tick and the same three repeats, but peers have no playout delay. The table has what each sends.";
+    let time = "The figure shows the same error over the processor time of a tick at the receiver, with a point for each network. The time includes decoding, correcting and stepping 60 modes, and between peers also the peer's own hands. It is the time of the thread itself on one core, the shortest of three runs. Differences below a fifth mean nothing.";
+    let jitter = "The figure shows the paper's worst network (9 % loss, 196 ms) without jitter, and with an extra delay of exponential distribution whose mean is 10 and 30 ms. All have the same playout delay and repeats. A path whose round trip scatters is taken for one with a queue, so that the host sends less at 30 ms.";
+    let burst = "The figure shows the same network by the mean length of a burst: 1 is random loss, and 4 and 12 are bursts of a Gilbert-Elliott path. The loss is 9 % in all cases.";
     let figures = [
-        ("f-network", "bytes", "down, kbit/s", words),
-        ("f-network-time", "time", "processor time of a tick, us", time),
+        ("f-network", "loss on the paper's four networks", "loss, %", Axes::LogarithmicError, words),
+        (
+            "f-network-time",
+            "the paper's four networks: time",
+            "processor time of a tick, us",
+            Axes::Logarithmic,
+            time,
+        ),
+        ("f-network-jitter", "jitter", "jitter, ms", Axes::LogarithmicError, jitter),
+        ("f-network-bursts", "bursts", "mean length of a burst, ticks", Axes::Logarithmic, burst),
     ];
-    let figures = figures.into_iter().enumerate().map(|(which, (file, title, x, words))| Figure {
+    let figures = figures.into_iter().enumerate().map(|(which, (file, title, x, axes, words))| Figure {
         file: file.into(),
-        title: format!("Ways of repair on the paper's four networks: {title}"),
+        title: format!("Ways of repair: {title}"),
         x: x.into(),
         y: "shown error, rms, % of the rms of the motion".into(),
-        logarithmic: true,
+        axes,
         series: schemes
             .iter()
             .zip(&points)
-            .map(|(scheme, p)| Series::new(scheme.name, p[which].clone()))
+            .map(|(scheme, p)| {
+                let series = Series::new(scheme.name, p[which].clone());
+                // The times of a way hardly differ from network to network.
+                if file == "f-network-time" { series.scattered() } else { series }
+            })
             .collect(),
         reference_error: None,
         words: words.into(),
+        below: None,
     });
     Ok((figures.collect(), text))
 }

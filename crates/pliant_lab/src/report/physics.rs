@@ -10,7 +10,7 @@ use pliant_modal::{
 };
 
 use super::{
-    plot::{Figure, Series},
+    plot::{Axes, Figure, Series},
     work::{anchor, baked, by_mass, config, farthest, time_us},
 };
 use crate::LabError;
@@ -151,10 +151,11 @@ pub(super) fn figure(
         title: title.into(),
         x: x.into(),
         y: y.into(),
-        logarithmic: true,
+        axes: Axes::Logarithmic,
         series,
         reference_error,
         words,
+        below: None,
     }
 }
 
@@ -243,7 +244,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
         None,
         "The figure shows the same error over time, with residual flexibility. The bar is dragged for one second and held for another.".into(),
     );
-    over_time.logarithmic = false;
+    over_time.axes = Axes::Linear;
     Ok(vec![
         figure(
             "b-modes",
@@ -360,7 +361,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
         None,
         "The figure shows the mass-weighted error of the displacement of the whole struck bar over time, at 60 steps a second. If a frequency is shifted, the error grows with every oscillation until the damping has ended the motion.".into(),
     );
-    over_time.logarithmic = false;
+    over_time.axes = Axes::Linear;
     let x = "us of one core for a second of motion";
     let order = "The reference is generalized-alpha at 7,680 steps a second. Its error is estimated as a third of its difference from 3,840 steps a second, because the method is of second order.";
     Ok(vec![
