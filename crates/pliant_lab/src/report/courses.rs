@@ -154,8 +154,8 @@ fn figure(course: &Course, force: bool) -> Figure {
     let points = |f: &Metrics, value: &dyn Fn(&TrackPoint) -> f64| {
         f.track.iter().map(|t| ((t.tick - first) as f64, value(t))).collect::<Vec<_>>()
     };
-    // All of the paper's hosts move alike, so that one true line stands for all: the one that begins
-    // first. The default's host has another integrator.
+    // All of the paper's hosts move alike, so that one true line stands for all: the one that
+    // begins first. The default's host has another integrator.
     let earliest = course
         .lines
         .iter()
