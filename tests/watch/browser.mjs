@@ -5,9 +5,29 @@ import { createServer } from "node:http";
 import { readFileSync, writeFileSync } from "node:fs";
 import { extname, join } from "node:path";
 
+/** How long something is waited for, ms. */
 const LONGEST = Number(process.env.LONGEST ?? 60_000);
+/** How long an answer of the browser is waited for, ms. */
+const ANSWER = 20_000;
 
 export const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
+
+/** What a promise becomes, or an error that says what it was, after a time. */
+export function within(ms, what, promise) {
+  let timer;
+  const late = new Promise((_, failed) => {
+    timer = setTimeout(() => failed(new Error(`${what}: not within ${ms / 1000} s`)), ms);
+  });
+  return Promise.race([promise, late]).finally(() => clearTimeout(timer));
+}
+
+/** Ends this program with a failure if it runs for longer: `state` tells where it is. */
+export function endAfter(ms, state) {
+  setTimeout(async () => {
+    console.error(`not at its end after ${ms / 1000} s: ${await within(5000, "its state", state()).catch(String)}`);
+    process.exit(1);
+  }, ms).unref();
+}
 
 const children = new Set();
 
@@ -43,6 +63,8 @@ export class Browser {
   #pending = "";
   #said = [];
   #session;
+  /** Whether the process of the page that was opened last has crashed. */
+  crashed = false;
   constructor(program, profile) {
     const flags = ["--headless=new", "--no-sandbox", "--no-first-run", "--remote-debugging-pipe"];
     const drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=960,720"];
@@ -58,29 +80,46 @@ export class Browser {
           this.#said.push(JSON.stringify(params.args?.map((one) => one.value ?? one.description) ?? params));
           if (this.#said.length > 40) this.#said.shift();
         }
+        if (method === "Inspector.targetCrashed") {
+          this.crashed = true;
+          this.#failAll("the page's process crashed");
+        }
         const waiting = this.#waiting.get(id);
         this.#waiting.delete(id);
         if (error) waiting?.[1](new Error(error.message));
         else waiting?.[0](result);
       }
     });
+    this.child.on("exit", (code, signal) => this.#failAll(`the browser ended: ${code ?? signal}`));
+    // A pipe to a browser that has ended is no reason to end without a word.
+    this.child.stdio[3].on("error", () => {});
   }
-  send(method, params = {}, sessionId = this.#session) {
+  // Who has crashed answers nothing, and says so once.
+  #failAll(why) {
+    for (const [, failed] of this.#waiting.values()) failed(new Error(why));
+    this.#waiting.clear();
+  }
+  /** A command and its answer, which is waited for `ms` at most. */
+  send(method, params = {}, sessionId = this.#session, ms = ANSWER) {
     const id = this.#next++;
     const answer = new Promise((...both) => this.#waiting.set(id, both));
     this.child.stdio[3].write(`${JSON.stringify({ id, method, params, ...(sessionId && { sessionId }) })}\0`);
-    return answer;
+    const about = `${method} ${(params.expression ?? params.url ?? "").slice(0, 80)}`.trim();
+    return within(ms, `the browser's answer to ${about}`, answer).finally(() => this.#waiting.delete(id));
   }
   async open(url) {
     const { targetId } = await this.send("Target.createTarget", { url: "about:blank" }, null);
     const attached = await this.send("Target.attachToTarget", { targetId, flatten: true }, null);
     this.#session = attached.sessionId;
+    this.crashed = false;
+    await this.send("Inspector.enable");
     await this.send("Page.enable");
     await this.send("Runtime.enable");
     await this.send("Page.navigate", { url });
   }
   /** The value of an expression in the page. */
   async value(expression) {
+    if (this.crashed) throw new Error("the page's process crashed");
     const options = { expression, returnByValue: true, awaitPromise: true };
     const { result, exceptionDetails } = await this.send("Runtime.evaluate", options);
     if (exceptionDetails) throw new Error(`${expression.slice(0, 80)}: ${JSON.stringify(exceptionDetails)}`);
@@ -88,7 +127,8 @@ export class Browser {
   }
   /** What the page says, and what it said to its console. */
   async state() {
-    const text = await this.value("`${document.body.innerText}\\n${pliant.wrongs().join()}`").catch((error) => `${error}`);
+    const expression = "`${document.body.innerText}\\n${pliant.wrongs().join()}\\n${JSON.stringify(pliant.numbers)}`";
+    const text = await within(3000, "the page's answer", this.value(expression)).catch((error) => `${error}`);
     return `${text}\n${this.#said.join("\n")}`;
   }
   async picture(file) {
@@ -100,13 +140,17 @@ export class Browser {
 /** Waits until something is so, and returns how long that took, s. */
 export async function until(browser, what, so) {
   const began = performance.now();
-  while (performance.now() - began < LONGEST) {
+  let last = "";
+  while (performance.now() - began < LONGEST && !browser.crashed) {
     // A browser that does not answer is no answer.
-    const late = sleep(LONGEST).then(() => false);
-    if (await Promise.race([so().catch(() => false), late])) return (performance.now() - began) / 1000;
+    try {
+      if (await so()) return (performance.now() - began) / 1000;
+      last = "";
+    } catch (error) {
+      last = `${error.message}\n`;
+    }
     await sleep(20);
   }
-  const state = await Promise.race([browser.state(), sleep(3000).then(() => "the page does not answer")]);
-  throw new Error(`${what}: not after ${LONGEST / 1000} s: ${state}`);
+  const passed = ((performance.now() - began) / 1000).toFixed(0);
+  throw new Error(`${what}: not after ${passed} s: ${last}${await browser.state()}`);
 }
-

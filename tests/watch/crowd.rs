@@ -5,8 +5,13 @@
 //! watch_crowd RELAY CERTIFICATE SESSION BODY.modal WATCHERS SECONDS [NAME=PID...]
 //! ```
 //!
+//! CERTIFICATE is the hash of the relays' certificate, or `system` for what the system trusts.
+//!
 //! Prints a line of JSON. Delays are behind the earliest arrival of any tick at any watcher, by the
-//! host's count of ticks: the path's own delay on loopback is not in them.
+//! host's count of ticks: the path's own delay on loopback is not in them. A frame is missing that
+//! lies between two heard ones, and all frames are after a watcher has heard nothing for the last
+//! second. Bytes and packets are all that crossed loopback: run it in a network namespace of its own
+//! where others use it too.
 #![allow(missing_docs, reason = "a program for measurements")]
 
 #[path = "../../examples/session/mod.rs"]
@@ -32,31 +37,42 @@ struct Heard {
     over: u64,
 }
 
+/// Bytes and packets that have crossed loopback so far.
+fn loopback() -> [u64; 2] {
+    let text = std::fs::read_to_string("/proc/net/dev").unwrap_or_default();
+    let line = text.lines().find_map(|line| line.trim().strip_prefix("lo:"));
+    let mut counts = line.unwrap_or_default().split_whitespace().map(|count| count.parse().unwrap_or(0));
+    [counts.next().unwrap_or(0), counts.next().unwrap_or(0)]
+}
+
 fn main() -> Result<(), Box<dyn Error>> {
     let given: Vec<String> = std::env::args().skip(1).collect();
     let [relays, certificate, name, body, watchers, seconds, processes @ ..] = &given[..] else {
         return Err("expected RELAY,.. CERTIFICATE SESSION BODY WATCHERS SECONDS [NAME=PID...]".into());
     };
+    // What all watchers cost themselves is told beside the rest.
+    let processes: Vec<&str> = processes.iter().map(String::as_str).chain(["crowd=self"]).collect();
     let (watchers, seconds): (usize, f64) = (watchers.parse()?, seconds.parse()?);
     let model = session::model(Path::new(body))?;
     let relays: Vec<&str> = relays.split(',').collect();
     let began = Instant::now();
     let mut crowd = Vec::new();
     for k in 0..watchers {
-        let options = RelayOptions::new(relays[k % relays.len()], name)
-            .with_certificate(certificate)
-            .ok_or("CERTIFICATE is no hash")?;
+        let mut options = RelayOptions::new(relays[k % relays.len()], name);
+        if certificate != "system" {
+            options = options.with_certificate(certificate).ok_or("CERTIFICATE is no hash")?;
+        }
         crowd.push((Instant::now(), Watcher::open(&options, vec![model.clone()])?, Heard::default()));
         // Not all handshakes in one moment.
         sleep(Duration::from_millis(5));
     }
     let (mut step, mut every) = (0.0, 1);
     // A few seconds until everybody has the first picture, then the measured time.
-    let mut measured: Option<(Instant, BTreeMap<&str, (f64, f64)>)> = None;
+    let mut measured: Option<(Instant, BTreeMap<&str, (f64, f64)>, [u64; 2])> = None;
     let mut late: Vec<f64> = Vec::new();
     loop {
         let now = Instant::now();
-        if let Some((since, _)) = &measured
+        if let Some((since, ..)) = &measured
             && (now - *since).as_secs_f64() > seconds
         {
             break;
@@ -93,14 +109,15 @@ fn main() -> Result<(), Box<dyn Error>> {
                 let (name, pid) = one.split_once('=')?;
                 Some((name, session::used_by(pid)?))
             });
-            measured = Some((now, used.collect()));
+            measured = Some((now, used.collect(), loopback()));
         }
         if idle {
             sleep(Duration::from_millis(1));
         }
     }
-    let Some((since, before)) = measured else { return Err("nothing was measured".into()) };
+    let Some((since, before, crossed)) = measured else { return Err("nothing was measured".into()) };
     let passed = since.elapsed().as_secs_f64();
+    let [bytes, packets] = [0, 1].map(|k| (loopback()[k] - crossed[k]) as f64 / passed);
     late.sort_by(f64::total_cmp);
     let part = |of: &[f64], share: f64| of.get((of.len() as f64 * share) as usize).copied().unwrap_or(0.0);
     let earliest = late.first().copied().unwrap_or(0.0);
@@ -108,10 +125,17 @@ fn main() -> Result<(), Box<dyn Error>> {
         crowd.iter().filter_map(|(_, _, heard)| Some(heard.first_picture?.as_secs_f64())).collect();
     pictures.sort_by(f64::total_cmp);
     let heard: u64 = crowd.iter().map(|(_, _, heard)| heard.count).sum();
-    let due = |heard: &Heard| if heard.count == 0 { 0 } else { (heard.last - heard.first) / every + 1 };
-    let missing: u64 = crowd.iter().map(|(_, _, heard)| due(heard).saturating_sub(heard.count)).sum();
+    let all = crowd.iter().map(|(_, _, heard)| heard);
+    let newest = all.clone().map(|heard| heard.last).max().unwrap_or(0);
+    let oldest = all.clone().filter(|heard| heard.count > 0).map(|heard| heard.first).min().unwrap_or(0);
+    let due = |heard: &Heard| {
+        let first = if heard.count > 0 { heard.first } else { oldest };
+        let silent = (newest - heard.last) as f64 * step > 1.0;
+        ((if silent { newest } else { heard.last }) - first) / every + 1
+    };
+    let missing: u64 = all.map(|heard| due(heard).saturating_sub(heard.count)).sum();
     let mut costs = String::new();
-    for one in processes {
+    for one in &processes {
         let Some((name, pid)) = one.split_once('=') else { continue };
         if let (Some((then, memory_then)), Some((now, memory))) = (before.get(name), session::used_by(pid)) {
             let share = 100.0 * (now - then) / passed;
@@ -122,7 +146,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     println!(
         "{{\"watchers\":{watchers},\"with_picture\":{},\"first_picture_s\":[{:.2},{:.2}],\"seconds\":{passed:.1},\
-         \"heard\":{heard},\"missing\":{missing},\"delay_ms\":[{:.1},{:.1}],\"wrong\":{},\"over\":{}{costs}}}",
+         \"heard\":{heard},\"missing\":{missing},\"delay_ms\":[{:.1},{:.1}],\"wrong\":{},\"over\":{},\
+         \"bytes_per_s\":{bytes:.0},\"packets_per_s\":{packets:.0}{costs}}}",
         pictures.len(),
         part(&pictures, 0.5),
         pictures.last().copied().unwrap_or(0.0),

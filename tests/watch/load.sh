@@ -1,11 +1,14 @@
 #!/bin/sh
 # What a session costs by the number of its watchers: the host, one relay or a cluster of two, and
 # the delay and the missing frames of the watchers, all on this machine over loopback. Prints a line
-# of JSON for each number of watchers.
+# of JSON for each number of watchers, then the host's lines of the measured time.
 #
 #   tests/watch/load.sh BODY.modal [SECONDS [WATCHERS...]]
 #
 # RELAYS=2: two relays, of which the second fetches from the first, with half of the watchers each.
+# RATE: frames a second, 30 by default. AS: a command that runs the host, such as nice -n -5. In a
+# network namespace of its own (unshare -n sh -c 'ip link set lo up; tests/watch/load.sh ...') the
+# bytes that are told are these processes' alone.
 # Needs moq-relay 0.17.10 (PLIANT_MOQ_RELAY, or in PATH), openssl and Linux; ends with 77 (skipped)
 # without. Programs: those of BIN (a target folder's debug/ or release/), or built by cargo.
 set -u
@@ -25,6 +28,8 @@ if [ -z "${BIN:-}" ]; then
     BIN=$(cargo metadata --format-version 1 --no-deps |
         sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
 fi
+# Each watcher has a socket and a loop of its own.
+ulimit -n "$(ulimit -Hn)"
 work=$(mktemp -d)
 pids=""
 stop() { for pid in $pids; do kill "$pid" 2>/dev/null; done; wait; pids=""; }
@@ -53,7 +58,8 @@ for n in $watchers; do
     fi
     # The host's ticks are among what is measured, so it goes before the crowd.
     ${AS:-} "$BIN/examples/dedicated_server" --bind 127.0.0.1:0 --hz 60 --play --body "$body" \
-        --publish "https://127.0.0.1:$first/" --certificate "$hash" --session load >"$work/host.log" 2>&1 &
+        --publish "https://127.0.0.1:$first/" --certificate "$hash" --session load \
+        --watch-rate "${RATE:-30}" >"$work/host.log" 2>&1 &
     pids="$pids $!"
     measured="$measured host=$!"
     sleep 3
@@ -62,6 +68,7 @@ for n in $watchers; do
         tail -3 "$work/relay.log" "$work/host.log" >&2
         exit 1
     }
-    tail -1 "$work/host.log"
+    # A line of the host is about ten seconds.
+    tail -n "$((seconds < 20 ? 1 : seconds / 10))" "$work/host.log"
     stop
 done

@@ -3,11 +3,11 @@
 import assert from "node:assert/strict";
 import { execFileSync, spawnSync } from "node:child_process";
 import { createHash } from "node:crypto";
-import { createWriteStream, existsSync } from "node:fs";
+import { existsSync } from "node:fs";
 import { createServer as createHttpServer } from "node:http";
 import { createServer as listen } from "node:net";
 import { join } from "node:path";
-import { Browser, serve, sleep, start, until } from "./browser.mjs";
+import { Browser, endAfter, serve, sleep, start, until, within } from "./browser.mjs";
 
 const { RELAY, CHROMIUM, BIN, WORK, OUT } = process.env;
 const HZ = 60;
@@ -23,7 +23,9 @@ const freePort = () =>
   });
 
 const site = join(WORK, "site");
-execFileSync(join(BIN, "pliant"), ["watch-page", site]);
+/** A program that is done at once: it fails if it takes longer than `timeout`, ms. */
+const limits = { timeout: 30_000, killSignal: "SIGKILL" };
+execFileSync(join(BIN, "pliant"), ["watch-page", site], limits);
 const pageAddress = await serve(site);
 
 // A certificate that lives longer than a relay: browsers take those of two weeks at most by their hash.
@@ -31,8 +33,8 @@ const [key, certificate] = [join(WORK, "key.pem"), join(WORK, "certificate.pem")
 const names = "subjectAltName=IP:127.0.0.1,DNS:localhost";
 const request = ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"];
 const about = ["-days", "10", "-subj", "/CN=localhost", "-addext", names, "-keyout", key, "-out", certificate];
-execFileSync("openssl", [...request, ...about], { stdio: "ignore" });
-const der = execFileSync("openssl", ["x509", "-in", certificate, "-outform", "der"]);
+execFileSync("openssl", [...request, ...about], { stdio: "ignore", ...limits });
+const der = execFileSync("openssl", ["x509", "-in", certificate, "-outform", "der"], limits);
 const hash = createHash("sha256").update(der).digest("hex");
 
 // Who may do what: the relay asks once for each connection. Only the host's token may publish; who
@@ -53,14 +55,19 @@ const auth = createHttpServer((request, answer) => {
 });
 await new Promise((done) => auth.listen(0, "127.0.0.1", done));
 
+// What the programs say is told where the test fails.
+const said = {};
+function listenTo(name, stream) {
+  stream.on("data", (data) => (said[name] = `${said[name] ?? ""}${data}`.slice(-4000)));
+}
+
 const port = await freePort();
 const relayAddress = `https://127.0.0.1:${port}/`;
 function startRelay() {
   const where = ["--listen", `127.0.0.1:${port}`, "--listen-tls-cert", certificate, "--listen-tls-key", key];
   const relay = start(RELAY, [...where, "--auth-url", `http://127.0.0.1:${auth.address().port}/`], { stdio: ["ignore", "pipe", "pipe"] });
-  const log = createWriteStream(join(WORK, "relay.log"), { flags: "a" });
-  relay.stdout.pipe(log, { end: false });
-  relay.stderr.pipe(log, { end: false });
+  listenTo("relay", relay.stdout);
+  listenTo("relay", relay.stderr);
   return relay;
 }
 
@@ -73,18 +80,22 @@ function startHost() {
       ["--publish", `${relayAddress}?jwt=of-the-host`, "--link-relay", relayAddress],
       ["--certificate", hash, "--page", pageAddress, "--session", "tests/body"],
     ),
-    { stdio: ["ignore", "pipe", "inherit"] },
+    { stdio: ["ignore", "pipe", "pipe"] },
   );
-  let told = "";
+  listenTo("host", host.stdout);
+  listenTo("host", host.stderr);
+  let text = "";
   const link = new Promise((done, failed) => {
     host.stdout.on("data", (data) => {
-      told += data;
-      const found = /^to watch in a browser: (.*)$/m.exec(told);
+      text += data;
+      const found = /^to watch in a browser: (.*)$/m.exec(text);
       if (found) done(found[1]);
     });
-    host.on("exit", () => failed(new Error(`the host ended: ${told}`)));
+    host.on("exit", () => failed(new Error("the host ended")));
   });
-  return { host, link };
+  // A host that is killed later has its link.
+  link.catch(() => {});
+  return { host, link: within(30_000, "the host's link", link) };
 }
 
 // Each number is printed as soon as it is known.
@@ -100,10 +111,15 @@ const told = new Proxy(
 );
 let relay = startRelay();
 let { host, link } = startHost();
+const browser = new Browser(CHROMIUM, join(WORK, "profile"));
+process.on("uncaughtExceptionMonitor", () => {
+  for (const [name, text] of Object.entries(said)) console.error(`the ${name} said: ${text}`);
+  console.error(`so far: ${JSON.stringify(told)}; asked: ${JSON.stringify(asked)}`);
+});
+endAfter(240_000, () => browser.state());
 const address = await link;
 assert.ok(address.startsWith(pageAddress) && address.includes(hash), address);
 assert.ok(!address.includes("of-the-host"), "the host's token is not in the link");
-const browser = new Browser(CHROMIUM, join(WORK, "profile"));
 await browser.open(address);
 await until(browser, "the first picture", () => browser.value("pliant.numbers.firstPicture > 0"));
 told.firstPicture = (await browser.value("pliant.numbers.firstPicture")) / 1000;
@@ -124,7 +140,9 @@ assert.ok(chosen.length >= 16, `${ticks.length} frames in 8 s`);
 await sleep(2000);
 const printed = spawnSync(join(BIN, "examples/watch_truth"), [trace, body, ...chosen.map(String)], {
   maxBuffer: 1 << 30,
+  ...limits,
 });
+assert.equal(printed.status, 0, `the truth: ${printed.error ?? printed.stderr}`);
 const truth = JSON.parse(printed.stdout);
 let [sum, most, moved, furthest, compared] = [0, 0, 0, chosen[0], 0];
 for (const [tick, positions] of Object.entries(truth.ticks)) {
@@ -152,7 +170,7 @@ const drawer = join(BIN, "examples/watch_picture");
 if (OUT !== WORK && existsSync(drawer)) {
   const [wide, high] = await browser.value("[innerWidth, innerHeight]");
   const given = [trace, body, `${furthest}`, join(OUT, "host.png"), `${wide}`, `${high}`];
-  told.hostPicture = spawnSync(drawer, given, { stdio: ["ignore", "ignore", "inherit"] }).status === 0;
+  told.hostPicture = spawnSync(drawer, given, { stdio: ["ignore", "ignore", "inherit"], timeout: 130_000 }).status === 0;
 }
 told.wrong = await browser.value("pliant.numbers.wrong");
 assert.equal(told.wrong, 0, await browser.value("document.getElementById('status').textContent"));
@@ -203,8 +221,16 @@ assert.ok(asked.host >= 3 && asked.watcher >= 2 && asked.refused === 0, JSON.str
 
 // Whoever has another token does not get in.
 await browser.open(address.replace(encodeURIComponent(relayAddress), encodeURIComponent(`${relayAddress}?jwt=no`)));
-await until(browser, "a refusal", async () => asked.refused > 0);
-await sleep(1000);
-assert.equal(await browser.value("pliant.numbers.frames"), 0);
+const refusal = async () => asked.refused > 0;
+try {
+  await until(browser, "a refusal", refusal);
+  await sleep(1000);
+  assert.equal(await browser.value("pliant.numbers.frames"), 0);
+} catch (error) {
+  // Chromium 156 itself often crashes the tab of a session that its server closes at once: nobody
+  // has got in then, either.
+  if (!browser.crashed || !(await refusal())) throw error;
+  console.log("refused; the browser's own fault then ended the tab");
+}
 console.log("all is well");
 process.exit(0);

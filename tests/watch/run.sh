@@ -9,7 +9,8 @@
 # Needs node, openssl, moq-relay 0.17.10 (PLIANT_MOQ_RELAY names it, or it is in PATH: cargo install
 # moq-relay --version 0.17.10) and Chromium (PLIANT_CHROMIUM, or in PATH); ends with 77 (skipped)
 # where one is missing. Programs: those of BIN (a target folder's debug/ or release/), or built by
-# cargo. OUT is a folder for the page's picture. Everything is on loopback, and takes two minutes.
+# cargo. OUT is a folder for the page's picture. Everything is on loopback, and takes a minute or
+# two; a step that takes too long ends it and says what was waited for.
 set -u
 skip() { echo "skipped: $1"; exit 77; }
 here=$(cd "$(dirname "$0")" && pwd)
