@@ -3,9 +3,11 @@
 /// Workspace of the solve. It grows when hands are added.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct System {
-    /// Matrix in row-major order, `n x n`.
+    /// Matrix in row-major order, `n x n`. Of a symmetric one, the upper triangle.
     matrix: Vec<f64>,
     right: Vec<f64>,
+    /// Workspace: a sum for each column.
+    sums: Vec<f64>,
     pivots: Vec<usize>,
     symmetric: bool,
 }
@@ -20,6 +22,7 @@ impl System {
         let n = 3 * hands;
         self.matrix.reserve((n * n).saturating_sub(self.matrix.len()));
         self.right.reserve(n.saturating_sub(self.right.len()));
+        self.sums.reserve(n.saturating_sub(self.sums.len()));
         self.pivots.reserve(n.saturating_sub(self.pivots.len()));
     }
 
@@ -34,7 +37,11 @@ impl System {
 
     pub(crate) fn set(&mut self, row: usize, column: usize, value: f64) {
         let n = self.right.len();
-        self.matrix[row * n + column] = value;
+        if !self.symmetric {
+            self.matrix[row * n + column] = value;
+        } else if column <= row {
+            self.matrix[column * n + row] = value;
+        }
     }
 
     pub(crate) fn right(&mut self) -> &mut [f64] {
@@ -48,40 +55,44 @@ impl System {
         if self.symmetric { self.cholesky() } else { self.eliminate() }
     }
 
-    /// Factors the lower triangle in place as `L L^T` and solves.
+    /// Factors the matrix in place as `U^T U` and solves.
+    ///
+    /// Each entry is a sum over the rows above, in their order. All sums of a row go on together,
+    /// so that none waits for itself.
     fn cholesky(&mut self) -> usize {
         let n = self.right.len();
-        let (m, x) = (&mut self.matrix, &mut self.right);
+        let (m, x, sums) = (&mut self.matrix, &mut self.right, &mut self.sums);
         let mut lost = 0;
         for j in 0..n {
-            let diagonal = m[j * n + j];
-            let square: f64 = m[j * n..j * n + j].iter().map(|a| a * a).sum();
-            let pivot = diagonal - square;
+            sums.clear();
+            sums.resize(n - j, 0.0);
+            let (above, rest) = m.split_at_mut(j * n);
+            add_rows(above, n, j, sums);
+            let row = &mut rest[j..n];
+            let diagonal = row[0];
+            let pivot = diagonal - sums[0];
             if pivot <= Self::LOST * diagonal.abs() {
                 lost += 1;
                 // The direction is a combination of earlier ones. A huge pivot gives it no share.
-                for i in j + 1..n {
-                    m[i * n + j] = 0.0;
-                }
-                m[j * n + j] = f64::MAX.sqrt();
+                row.fill(0.0);
+                row[0] = f64::MAX.sqrt();
                 continue;
             }
             let root = pivot.sqrt();
-            m[j * n + j] = root;
-            for i in j + 1..n {
-                let (above, below) = m.split_at_mut(i * n);
-                let (other, row) = (&above[j * n..j * n + j], &mut below[..n]);
-                let sum: f64 = row[..j].iter().zip(other).map(|(a, b)| a * b).sum();
-                row[j] = (row[j] - sum) / root;
+            row[0] = root;
+            for (a, sum) in row[1..].iter_mut().zip(&sums[1..]) {
+                *a = (*a - sum) / root;
             }
         }
-        for j in 0..n {
-            let sum: f64 = m[j * n..j * n + j].iter().zip(x.iter()).map(|(a, b)| a * b).sum();
-            x[j] = (x[j] - sum) / m[j * n + j];
+        sums.clear();
+        sums.resize(n, 0.0);
+        for (j, row) in m.chunks_exact(n.max(1)).enumerate() {
+            x[j] = (x[j] - sums[j]) / row[j];
+            sums[j + 1..].iter_mut().zip(&row[j + 1..]).for_each(|(sum, a)| *sum += a * x[j]);
         }
-        for j in (0..n).rev() {
-            let sum: f64 = (j + 1..n).map(|k| m[k * n + j] * x[k]).sum();
-            x[j] = (x[j] - sum) / m[j * n + j];
+        for (j, row) in m.chunks_exact(n.max(1)).enumerate().rev() {
+            let sum: f64 = row[j + 1..].iter().zip(&x[j + 1..]).map(|(a, b)| a * b).sum();
+            x[j] = (x[j] - sum) / row[j];
         }
         lost
     }
@@ -138,6 +149,25 @@ impl System {
     }
 }
 
+/// Adds to each sum, of column `j` and the ones after it, the products of its column with column
+/// `j` over the given rows of length `n`.
+fn add_rows(rows: &[f64], n: usize, j: usize, sums: &mut [f64]) {
+    let count = sums.len();
+    let mut four = rows.chunks_exact(4 * n.max(1));
+    for rows in &mut four {
+        let row = |k: usize| &rows[k * n + j..][..count];
+        let [a, b, c, d] = [row(0), row(1), row(2), row(3)];
+        let by = [a[0], b[0], c[0], d[0]];
+        for (i, sum) in sums.iter_mut().enumerate() {
+            *sum = (((*sum + by[0] * a[i]) + by[1] * b[i]) + by[2] * c[i]) + by[3] * d[i];
+        }
+    }
+    for row in four.remainder().chunks_exact(n.max(1)) {
+        let row = &row[j..];
+        sums.iter_mut().zip(row).for_each(|(sum, a)| *sum += row[0] * a);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -171,6 +201,39 @@ mod tests {
         let full = [4.0, 2.0, 0.0, 2.0, 5.0, 3.0, 0.0, 3.0, 6.0];
         for symmetric in [true, false] {
             assert_eq!(solved(&full, &[0.0, 1.0, 12.0], symmetric), 0);
+        }
+    }
+
+    /// Steps of all copies of a body agree to the bit only as long as the sums keep their order.
+    #[test]
+    fn each_entry_of_the_factors_is_summed_in_the_order_of_the_rows() {
+        for n in [1, 2, 7, 30] {
+            let value = |i: usize, j: usize| ((3 * i + 5 * j) as f64).sin() / (1 + i + j) as f64;
+            let entry = |i: usize, j: usize| {
+                (0..n).map(|k| value(i, k) * value(j, k)).sum::<f64>() + if i == j { 1.0 } else { 0.0 }
+            };
+            let full: Vec<f64> = (0..n * n).map(|at| entry(at / n, at % n)).collect();
+            let right: Vec<f64> = (0..n).map(|i| (i as f64).cos()).collect();
+            let mut system = system(&full, &right, true);
+            assert_eq!(system.solve(), 0);
+            let mut l = vec![vec![0.0; n]; n];
+            for i in 0..n {
+                for j in 0..=i {
+                    let sum: f64 = (0..j).map(|k| l[i][k] * l[j][k]).sum();
+                    let rest = full[i * n + j] - sum;
+                    l[i][j] = if i == j { rest.sqrt() } else { rest / l[j][j] };
+                }
+            }
+            let mut x = right.clone();
+            for i in 0..n {
+                let sum: f64 = (0..i).map(|k| l[i][k] * x[k]).sum();
+                x[i] = (x[i] - sum) / l[i][i];
+            }
+            for i in (0..n).rev() {
+                let sum: f64 = (i + 1..n).map(|k| l[k][i] * x[k]).sum();
+                x[i] = (x[i] - sum) / l[i][i];
+            }
+            assert_eq!(system.right().to_vec(), x, "{n} rows");
         }
     }
 
