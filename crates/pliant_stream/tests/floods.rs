@@ -113,6 +113,44 @@ fn sixty_four_targets_in_each_datagram_move_a_hand_no_more_often_than_a_hand_mov
 }
 
 #[test]
+fn a_goodbye_is_heard_also_when_others_flood_before_the_events_are_taken() {
+    const HOLDERS: u64 = 8;
+    let (mut host, now, leaver) = (host(), Duration::ZERO, PeerId(100));
+    for peer in (2..=HOLDERS).map(PeerId).chain([leaver]) {
+        host.connect(now, peer, 1200).unwrap();
+        host.on_message(now, peer, &hello());
+    }
+    let holders = (1..=HOLDERS).map(PeerId);
+    holders.clone().for_each(|peer| host.on_message(now, peer, &begin(0, 4 * peer.0 as u32, 0.05)));
+    host.on_message(now, leaver, &begin(0, 400, 0.05));
+    while host.poll_event().is_some() {}
+    // One says goodbye, and before anybody looks, each of the others moves its hand a thousand
+    // times, which is its budget.
+    host.on_message(now, leaver, &GuestMessage::Goodbye { reason: DisconnectReason::Left }.encode());
+    let mut sent = 0;
+    for input in (1..1000_u32).step_by(3) {
+        for peer in holders.clone() {
+            let target =
+                |k: u32| TargetEntry { grab: 0, input: input + k, target: [1.0, 1e-4 * f64::from(k), 0.0] };
+            let datagram = Datagram::Targets(Targets { entries: (0..3).map(target).collect() });
+            host.on_datagram(now, peer, &datagram.encode(input as u16));
+            sent += 3;
+        }
+    }
+    let events: Vec<HostEvent> = std::iter::from_fn(|| host.poll_event()).collect();
+    println!("{sent} targets after a goodbye: {} events, {} dropped", events.len(), host.dropped_events());
+    assert!(host.dropped_events() > 1000, "the flood is longer than the queue");
+    let left = |event: &&HostEvent| matches!(event, HostEvent::Left { peer, .. } if *peer == leaver);
+    let let_go = |event: &&HostEvent| matches!(event, HostEvent::GrabEnded { .. });
+    assert_eq!((events.iter().filter(left).count(), events.iter().filter(let_go).count()), (1, 1));
+    // The newest movements of all are there.
+    for user in host.users().map(|(_, user, _)| user).take(HOLDERS as usize) {
+        let last = |event: &HostEvent| matches!(event, HostEvent::GrabMoved { key, input: 999, .. } if key.user == user);
+        assert!(events.iter().any(last), "{user:?}");
+    }
+}
+
+#[test]
 fn a_guest_strikes_no_more_often_than_its_budget_and_stays_in() {
     let (mut host, now) = (host(), Duration::ZERO);
     while host.poll_event().is_some() {}

@@ -342,7 +342,8 @@ impl HostSession {
         self.events.pop()
     }
 
-    /// Number of events that were dropped because the application did not fetch them.
+    /// Number of events that were dropped because the application did not fetch them. Of 4,096 that
+    /// wait, the oldest movement of a hand or impulse goes first.
     pub fn dropped_events(&self) -> u64 {
         self.events.dropped()
     }
@@ -359,7 +360,10 @@ impl HostSession {
     }
 
     pub(super) fn event(&mut self, event: HostEvent) {
-        self.events.push(event);
+        // Who moves a hand often must not hide that others come, go, grab and let go.
+        self.events.push_sparing(event, |event| {
+            matches!(event, HostEvent::GrabMoved { .. } | HostEvent::Impulse { .. })
+        });
     }
 
     fn admit(&mut self, now: Duration, peer: PeerId, before: Option<UserId>, role: Role) {
