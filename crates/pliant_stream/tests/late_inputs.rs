@@ -8,11 +8,11 @@ mod support;
 use std::time::{Duration, Instant};
 
 use pliant_modal::FixedObstacle;
-use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig};
+use pliant_stream::peer::{PeerEvent, PeerSession};
 use pliant_stream::wire::{Datagram, HeldAt, ImpulseAt, InputTick, Inputs, PROTOCOL_VERSION, PeerMessage};
-use pliant_stream::{Channel, DisconnectReason, PeerId, StepSettings, Surroundings, UserId};
+use pliant_stream::{Channel, DisconnectReason, PeerId, Surroundings, UserId};
 use support::direct::{BODY, peers, peers_of};
-use support::{bar, loose_bar};
+use support::loose_bar;
 
 /// How late the inputs come, ticks: one less than is remembered, and as late as can be afforded.
 const LATE: [u64; 2] = [127, 15];
@@ -258,97 +258,6 @@ fn who_leaves_with_many_hands_after_a_silence_makes_nobody_step_many_ticks_again
     assert!(most <= 17, "{most} ticks stepped again in an update");
 }
 
-/// What a crowd on one body has cost the first peer in ten seconds.
-struct Load {
-    first: PeerSession,
-    /// Ticks that were stepped again, by update.
-    restepped: Vec<u64>,
-    times: Vec<Duration>,
-}
-
-/// Ten seconds of a crowd whose members hold one body with four hands each. All inputs come `late`
-/// ticks after their tick.
-fn load_of(members: u16, late: u64) -> Load {
-    let config = PeerSessionConfig { user: UserId(1), ..Default::default() };
-    let mut first = PeerSession::new(config).unwrap();
-    first.add_body(BODY, bar(40, 0.05), &StepSettings::default()).unwrap();
-    let (mut now, scene) = (BEGIN, first.scene());
-    for k in 0..members {
-        let peer = PeerId(u64::from(k));
-        first.accept(now, peer, 1200).unwrap();
-        let hello = PeerMessage::Hello {
-            version: PROTOCOL_VERSION,
-            user: k + 2,
-            name: format!("member {k}"),
-            address: String::new(),
-            joining: false,
-            scene,
-        };
-        first.on_message(now, peer, &hello.encode());
-        assert_eq!(first.user_of(peer), Some(UserId(k + 2)));
-    }
-    // Their patches are alike, so that the budgets of new ones do not count.
-    let input = |member: u16, tick: u64| {
-        let hand = |k: u16| HeldAt {
-            body: BODY,
-            grab: k,
-            vertex: 4 + u32::from((4 * member + k) % 60),
-            radius: 0.125,
-            target: [1.0, 0.01 * (0.1 * tick as f64).sin(), 0.0],
-            hold: Default::default(),
-        };
-        InputTick { tick, held: (0..4).map(hand).collect(), impulses: Vec::new() }
-    };
-    let (mut restepped, mut times) = (Vec::new(), Vec::new());
-    for round in 0..600_u64 {
-        now += TICK;
-        let (attacks, tick) = (round >= 200, first.tick());
-        for k in 0..members {
-            let behind = if attacks { late } else { 0 };
-            let ticks = vec![input(k, (tick + 1).saturating_sub(behind).max(1))];
-            let inputs = Inputs { now: tick, ahead: None, ticks, check: None };
-            first.on_datagram(now, PeerId(u64::from(k)), &Datagram::Inputs(inputs).encode(round as u16));
-        }
-        let before = first.body(BODY).unwrap().restepped();
-        let began = Instant::now();
-        first.update(now);
-        if attacks {
-            times.push(began.elapsed());
-            restepped.push(first.body(BODY).unwrap().restepped() - before);
-        }
-        while first.poll_output().is_some() {}
-    }
-    Load { first, restepped, times }
-}
-
-#[test]
-fn of_a_crowds_hands_thirty_two_act_on_a_body_and_each_users_first_ones_first() {
-    for (members, hands, most) in [(4, 16, 4), (8, 32, 4), (24, 32, 2), (40, 32, 1)] {
-        let Load { first, .. } = load_of(members, 0);
-        let grabs = first.body(BODY).unwrap().grabs();
-        let of = |user: u16| grabs.iter().filter(|grab| grab.key.user == UserId(user)).count();
-        let each: Vec<usize> = (2..members + 2).map(of).collect();
-        println!("{members} members with four hands each: {} hands act, {each:?}", grabs.len());
-        assert_eq!((grabs.len(), each.iter().max()), (hands, Some(&most)));
-        assert!(members > 32 || each.iter().all(|count| *count >= most - 1), "{each:?}");
-        assert!(grabs.iter().all(|grab| usize::from(grab.key.grab) < most), "the first ones");
-    }
-}
-
-#[test]
-fn late_inputs_are_paid_for_by_the_hands_of_all() {
-    // Too late for a share, of 64 at once.
-    let late = 40;
-    let Load { restepped, .. } = load_of(24, late);
-    let steps: u64 = restepped.iter().sum();
-    // Of the budget of all, which begins full, a tick costs 37. The last ticks may be owed. The
-    // first inputs that come late are known.
-    let most = (512.0 + (400 - late) as f64 * 384.0) / 37.0 + late as f64;
-    println!("24 members: {steps} ticks stepped again of {most:.0}, with 32 hands each");
-    assert!((steps as f64) <= most, "{steps} of {most}");
-    assert!((steps as f64) > 0.9 * most, "what can be afforded is taken: {steps} of {most}");
-}
-
 /// The time of an update. Run by hand, on a quiet machine and with `--release`.
 #[test]
 #[ignore = "measures times"]
@@ -359,22 +268,5 @@ fn time_of_an_update_while_inputs_come_as_late_as_can_be() {
         let at = |share: f64| cost.times[(share * (cost.times.len() - 1) as f64) as usize];
         println!("{late} ticks late: median {:?}, p99 {:?}, longest {:?}", at(0.5), at(0.99), at(1.0));
         assert!(at(0.99) < Duration::from_millis(2), "p99 {:?}", at(0.99));
-    }
-}
-
-/// The same for a crowd, whose inputs come as late as they can be paid for.
-#[test]
-#[ignore = "measures times"]
-fn time_of_an_update_while_a_crowds_inputs_come_as_late_as_can_be() {
-    for (members, late) in [(2, 8), (2, 40), (8, 8), (8, 40), (24, 8), (24, 40)] {
-        let Load { mut times, restepped, .. } = load_of(members, late);
-        times.sort();
-        let at = |share: f64| times[(share * (times.len() - 1) as f64) as usize];
-        let again = restepped.iter().sum::<u64>() as f64 / restepped.len() as f64;
-        println!(
-            "{members} members, {late} ticks late: {again:.1} ticks again an update; median {:?}, p99 {:?}",
-            at(0.5),
-            at(0.99)
-        );
     }
 }

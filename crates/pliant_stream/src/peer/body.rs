@@ -1,10 +1,15 @@
 //! One body at a peer: stepped at once, and stepped again when a late input arrives.
 
+mod passes;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use pliant_modal::{Frame, HeldPlace, HeldShapes, Load, ModalModel, StepSettings};
+
+pub(crate) use passes::CONTACT_COST;
+use passes::Pass;
 
 use super::columns::{Columns, Taken};
 use super::inputs::{BodyInputs, InputLog, WINDOW};
@@ -48,6 +53,11 @@ pub struct PeerBody {
     used: Ring<BodyInputs>,
     visual: VisualCopy,
     grabs: Vec<GrabState>,
+    /// Ticks that are gone through again, and the first one that the next pass begins with.
+    pass: Option<Pass>,
+    late: Option<Tick>,
+    /// Memory for the inputs of a tick that is gone through again.
+    again: BodyInputs,
     restepped: u64,
     pub(crate) columns: Columns,
     /// Whether the body is stepped with own shapes of held patches, where it can be.
@@ -85,6 +95,9 @@ impl PeerBody {
             inputs: BodyInputs::default(),
             used: Ring::new(WINDOW),
             grabs: Vec::new(),
+            pass: None,
+            late: None,
+            again: BodyInputs::default(),
             restepped: 0,
             columns: Columns::default(),
             wants_shapes: true,
@@ -206,8 +219,8 @@ impl PeerBody {
         order.into_iter().filter_map(place).collect()
     }
 
-    /// Takes shapes of held patches that were made, and steps again what lacked them. Returns for
-    /// what they were taken, and false when the tick from which they count is not remembered.
+    /// Takes shapes of held patches that were made, and marks the ticks that lacked them. Returns
+    /// for what they were taken, and false when the tick from which they count is not remembered.
     pub(crate) fn take_shapes(
         &mut self,
         places: &[HeldPlace],
@@ -226,7 +239,11 @@ impl PeerBody {
         }
         // What is before the last state that was taken stays as the state had it.
         let from = from.max(taken + 1);
-        (found, from > self.tick() || self.correct(from, inputs))
+        let is_whole = from > self.tick() || self.rollback.at(from - 1).is_some();
+        if is_whole {
+            self.mark(from);
+        }
+        (found, is_whole)
     }
 
     /// All grabs of the body, with their reactions.
@@ -292,8 +309,9 @@ impl PeerBody {
         })
     }
 
-    /// Takes a state and steps from it to the tick `to`. Returns false when the state does not fit
-    /// the body.
+    /// Takes a state of a tick. A body without a state so far steps from it to the tick `to`, and
+    /// another one does so with the next updates. Returns false when the state does not fit the
+    /// body.
     pub(crate) fn import(&mut self, tick: Tick, to: Tick, state: &PeerBodyState, inputs: &InputLog) -> bool {
         let received = state
             .frame
@@ -326,113 +344,46 @@ impl PeerBody {
         };
         let hands = state.pulls.iter().map(hand).collect();
         let contacts = state.contacts.clone();
-        let before =
-            std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands, contacts, shapes });
-        let fresh = self.tick() == 0;
-        self.reach(tick);
-        while self.tick() < to {
-            self.step_once(inputs);
-        }
-        if fresh {
-            self.visual.clear();
+        let received = BodyCopy { state: received, hands, contacts, shapes };
+        (self.pass, self.late) = (None, None);
+        inputs.of_body(tick, self.id, &self.forecast, &mut self.again);
+        if self.tick() == 0 || tick >= self.tick() {
+            let before = std::mem::replace(&mut self.rollback.now, received);
+            let fresh = self.tick() == 0;
+            self.inputs.clone_from(&self.again);
+            self.reach(tick);
+            while self.tick() < to {
+                self.step_once(inputs);
+            }
+            if fresh {
+                self.visual.clear();
+            } else {
+                self.visual.add(&self.model, &before.state, &self.rollback.now.state);
+            }
+            self.show();
         } else {
-            self.visual.add(&self.model, &before.state, &self.rollback.now.state);
+            self.rollback.remember(tick, &received);
+            self.used.place(tick).0.clone_from(&self.again);
+            self.pass = Some(Pass { tick, copy: Some(received) });
         }
-        self.show();
         true
     }
 
-    /// Steps to the next tick.
+    /// Steps to the next tick, and goes on with what is gone through again, so that it comes no
+    /// farther behind.
     pub(crate) fn advance(&mut self, inputs: &InputLog) {
+        self.go_on(inputs);
         self.step_once(inputs);
         self.visual.advance();
         self.show();
     }
 
-    /// Corrects the state for new inputs at tick `from` and later. Returns false when `from` is not
-    /// remembered.
-    pub(crate) fn correct(&mut self, from: Tick, inputs: &InputLog) -> bool {
-        let to = self.tick();
-        if from > to {
-            return true;
-        }
-        let Some(base) = from.checked_sub(1) else { return false };
-        if self.rollback.at(base).is_none() {
-            return false;
-        }
-        let before = self.live().clone();
-        // Equations (8) and (9) know nothing of shapes of held patches.
-        let compensates = self.repair == LateInputRepair::Compensate && self.columns.is_empty();
-        if compensates && !self.lacks_impulse(from, inputs) {
-            self.compensate(from, inputs);
-        } else {
-            self.rollback.back_to(base);
-            while self.tick() < to {
-                self.step_once(inputs);
-                self.restepped += 1;
-            }
-        }
-        self.visual.add(&self.model, &before, &self.rollback.now.state);
-        true
-    }
-
-    /// Whether an impulse at tick `from` or later did not act yet. It changes velocities at once,
-    /// which no acceleration of equations (8) and (9) does.
-    fn lacks_impulse(&self, from: Tick, inputs: &InputLog) -> bool {
-        let mut known = BodyInputs::default();
-        (from..=self.tick()).any(|tick| {
-            inputs.of_body(tick, self.id, &self.forecast, &mut known);
-            self.used.get(tick).is_none_or(|used| used.impulses != known.impulses)
-        })
-    }
-
-    /// Applies equations (8) and (9) to every tick from `from` on whose known inputs differ from
-    /// those used.
-    fn compensate(&mut self, from: Tick, inputs: &InputLog) {
-        let (mut done, last) = (BodyInputs::default(), self.tick());
-        for tick in from..=last {
-            let known = inputs.of_body(tick, self.id, &self.forecast, &mut done);
-            let Some(used) = self.used.get_mut(tick).filter(|used| known && done != **used) else { continue };
-            let Some(before) = self.rollback.at(tick - 1) else { continue };
-            let (mut with, mut without) = (before.clone(), before.clone());
-            Self::press(&mut self.replica, &mut with, &done, None);
-            Self::press(&mut self.replica, &mut without, used, None);
-            used.clone_from(&done);
-            let (with_frame, without_frame) = (with.state.frame, without.state.frame);
-            // The history is corrected like the present state, because later corrections and checks
-            // use it.
-            for t in tick..=last {
-                let (to_q, to_v) = self.newmark.response(t - tick);
-                let to_z = self.viscoelastic.as_ref().map_or(0.0, |filter| filter.response(t - tick));
-                let seconds = (t - tick) as f64 * self.replica.kernel().h();
-                let Some(past) = self.rollback.at_mut(t) else { continue };
-                let state = &mut past.state;
-                if self.model.is_free() {
-                    state.frame = moved(&self.model, &state.frame, [&with_frame, &without_frame], seconds);
-                }
-                for k in 0..state.modes() {
-                    let da = with.state.a[k] - without.state.a[k];
-                    // The difference at the tick itself is known exactly.
-                    let own = t == tick;
-                    state.q[k] += if own { with.state.q[k] - without.state.q[k] } else { to_q * da };
-                    state.v[k] += if own { with.state.v[k] - without.state.v[k] } else { to_v * da };
-                    if let Some(z) = state.z.get_mut(k) {
-                        *z += to_z * da;
-                    }
-                }
-            }
-            if let Some(now) = self.rollback.at_mut(tick) {
-                (now.state.a, now.state.f) = (with.state.a, with.state.f);
-                now.hands = with.hands;
-            }
-            self.restepped += 1;
-        }
-        self.rollback.back_to(last);
-    }
-
     fn step_once(&mut self, inputs: &InputLog) {
         let tick = self.tick() + 1;
         inputs.of_body(tick, self.id, &self.forecast, &mut self.inputs);
+        if self.pass.is_some() {
+            self.lead_on(tick, inputs);
+        }
         let shapes = self.columns.of_step(tick, &self.inputs);
         Self::press(&mut self.replica, &mut self.rollback.now, &self.inputs, shapes);
         self.reach(tick);
@@ -497,19 +448,4 @@ fn name(shapes: &HeldShapes) -> f64 {
         (hash ^ word).wrapping_mul(0x0000_0100_0000_01B3).rotate_left(29)
     });
     (hash >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
-}
-
-/// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds`
-/// ago. The difference in velocity and spin has acted since.
-fn moved(model: &ModalModel, frame: &Frame, [there, here]: [&Frame; 2], seconds: f64) -> Frame {
-    let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
-    let (faster, spin) = (of(Frame::velocity), of(Frame::spin));
-    let center = Vector3::from(frame.center()) + of(Frame::center) + faster * seconds;
-    let turning = there.angular_velocity(model) - here.angular_velocity(model);
-    let turned = (there.rotation() * here.rotation().inverse()).scaled_axis() + turning * seconds;
-    let turn = UnitQuaternion::from_scaled_axis(turned) * frame.rotation();
-    let velocity = Vector3::from(frame.velocity()) + faster;
-    let spin = Vector3::from(frame.spin()) + spin;
-    let q = [turn.i, turn.j, turn.k, turn.w];
-    Frame::from_motion(model, center.into(), q, velocity.into(), spin.into()).unwrap_or(*frame)
 }

@@ -19,6 +19,11 @@ const MAX_HANDS: usize = Body::MAX_GRABS;
 /// its step, as a number of steps without hands.
 const SQUARED_HANDS_PER_STEP: u64 = 32;
 
+/// The cost of a step with a number of hands on the body, as a number of steps without hands.
+pub(crate) fn step_cost(hands: u64) -> u64 {
+    1 + hands.min(MAX_HANDS as u64).pow(2) / SQUARED_HANDS_PER_STEP
+}
+
 /// What all users do with one body at one tick, by user.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct BodyInputs {
@@ -74,33 +79,33 @@ impl UserInputs {
         true
     }
 
-    /// Appends what the user held at a tick, known or extrapolated. Returns true when the input is
-    /// known.
-    fn held(&self, tick: Tick, forecast: &Forecast, out: &mut Vec<HeldAt>) -> bool {
+    /// The input whose hands act at a tick, and whether it is known: that of the tick, or the last
+    /// one before, from which hands go on. `None` where the user holds nothing.
+    pub(crate) fn acting(&self, tick: Tick) -> (Option<&InputTick>, bool) {
         if tick < self.first || (self.gone && tick > self.highest) {
-            return true;
+            return (None, true);
         }
         if let Some(input) = self.at(tick) {
-            out.extend_from_slice(&input.held);
-            return true;
+            return (Some(input), true);
         }
-        let last = (1..WINDOW as u64).map_while(|b| tick.checked_sub(b)).find_map(|t| self.at(t));
-        if let Some(last) = last {
-            for g in &last.held {
-                let samples: Vec<_> = (0..forecast.window())
-                    .map_while(|back| last.tick.checked_sub(back).map(|t| (back, t)))
-                    .filter_map(|(back, t)| {
-                        let held = self.at(t)?.held.iter().find(|x| x.grab == g.grab && x.body == g.body)?;
-                        let [x, y, z] = held.target;
-                        Some((back, [x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-                    })
-                    .collect();
-                let target =
-                    forecast.go_on(&samples, tick - last.tick).map_or(g.target, |f| [f[0], f[1], f[2]]);
-                out.push(HeldAt { target, ..*g });
-            }
+        ((1..WINDOW as u64).map_while(|b| tick.checked_sub(b)).find_map(|t| self.at(t)), false)
+    }
+
+    /// Where a hand of the input of tick `last` is at a later tick. `samples` is a workspace.
+    fn forecast(
+        &self,
+        (g, last): (&HeldAt, Tick),
+        tick: Tick,
+        forecast: &Forecast,
+        samples: &mut Vec<(u64, [f64; 3])>,
+    ) -> [f64; 3] {
+        samples.clear();
+        for back in 0..=forecast.window().saturating_sub(1).min(last) {
+            let input = self.at(last - back);
+            let held = input.and_then(|i| i.held.iter().find(|x| x.grab == g.grab && x.body == g.body));
+            samples.extend(held.map(|held| (back, held.target)));
         }
-        false
+        forecast.go_on(samples, tick - last).unwrap_or(g.target)
     }
 }
 
@@ -148,15 +153,27 @@ impl InputLog {
         out.held.clear();
         out.impulses.clear();
         let mut known = true;
-        let mut held = Vec::new();
         for (user, inputs) in &self.users {
-            held.clear();
-            known &= inputs.held(tick, forecast, &mut held);
+            let (acting, is_known) = inputs.acting(tick);
+            known &= is_known;
+            let held = acting.map_or(&[][..], |input| &input.held);
             out.held.extend(held.iter().filter(|g| g.body == body).map(|g| (*user, *g)));
             let impulses = inputs.at(tick).map_or(&[][..], |input| &input.impulses);
             out.impulses.extend(impulses.iter().filter(|i| i.body == body).map(|i| (*user, *i)));
         }
         make_room(&mut out.held);
+        // Only the hands that act are worth a forecast. Those of a user follow each other.
+        let (mut samples, mut of) = (Vec::new(), None::<(UserId, &UserInputs, Tick)>);
+        for (user, g) in &mut out.held {
+            if of.is_none_or(|(of, ..)| of != *user) {
+                let Some(inputs) = self.users.get(user) else { continue };
+                let Some(last) = inputs.acting(tick).0 else { continue };
+                of = Some((*user, inputs, last.tick));
+            }
+            if let Some((_, inputs, last)) = of.filter(|(.., last)| *last < tick) {
+                g.target = inputs.forecast((g, last), tick, forecast, &mut samples);
+            }
+        }
         known
     }
 
@@ -168,8 +185,7 @@ impl InputLog {
         for held in present.filter_map(UserInputs::newest).flat_map(|input| &input.held) {
             *hands.entry(held.body).or_default() += 1;
         }
-        let cost = |hands: u64| hands.min(MAX_HANDS as u64).pow(2) / SQUARED_HANDS_PER_STEP;
-        hands.into_values().map(cost).sum()
+        hands.into_values().map(|hands| step_cost(hands) - 1).sum()
     }
 
     /// The newest tick up to which all inputs are known.

@@ -77,7 +77,8 @@ pub struct PeerSession {
     /// Ticks that this peer has lately caught up to the others. If they turn out to be behind, it
     /// waits as many.
     caught_up: u64,
-    rollback_from: Option<Tick>,
+    /// The body that goes through past ticks first.
+    turn: BodyId,
     /// The tick of the last state taken. Rollback never goes to an earlier tick.
     taken: Tick,
     out: VecDeque<Output>,
@@ -137,7 +138,7 @@ impl PeerSession {
             catches_up: false,
             missed: 0,
             caught_up: 0,
-            rollback_from: None,
+            turn: BodyId(0),
             taken: 0,
             out: VecDeque::new(),
             events: Events::default(),
@@ -248,9 +249,9 @@ impl PeerSession {
         self.tick
     }
 
-    /// The newest tick for which all inputs are known. Its state is final.
+    /// The newest tick for which all inputs are known and have acted. Its state is final.
     pub fn confirmed(&self) -> Tick {
-        self.inputs.complete().min(self.tick)
+        self.inputs.complete().min(self.settled())
     }
 
     /// The state of a body after one of the last 128 ticks.
@@ -290,7 +291,6 @@ impl PeerSession {
                 }
                 for input in ticks {
                     let tick = input.tick;
-                    let planned = self.rollback_from.unwrap_or(self.tick + 1);
                     // A tick in the far future is not stored, since it would displace ticks that
                     // are needed.
                     if tick > self.tick + WINDOW as u64 / 2 {
@@ -298,14 +298,19 @@ impl PeerSession {
                     }
                     // What costs too much counts as lost. It is requested again, and when it has
                     // been missing for too long, a state repairs all.
-                    let pays = (&mut *other, &mut self.shared);
-                    if !self.inputs.lacks(user, tick)
-                        || !affords(now, pays, (&self.bodies, &self.inputs), &input, planned)
-                    {
+                    if !self.inputs.lacks(user, tick) {
                         continue;
                     }
-                    if self.inputs.put(user, input) && tick <= self.tick {
-                        self.rollback_from = Some(self.rollback_from.map_or(tick, |d| d.min(tick)));
+                    let bodies = self.changed_by(user, &input);
+                    let waits = |id: &BodyId| !self.bodies.get(id).is_some_and(|b| b.cannot_wait(tick));
+                    let again = self.ticks_again(&bodies, tick);
+                    let Some(other) = self.others.get_mut(&peer) else { return };
+                    let pays = (other, &mut self.shared);
+                    if bodies.iter().all(waits)
+                        && affords(now, pays, (&self.bodies, &self.inputs), &input, again)
+                        && self.inputs.put(user, input)
+                    {
+                        self.mark(&bodies, tick);
                     }
                 }
                 if let Some(check) = check {
@@ -390,6 +395,7 @@ impl PeerSession {
         }
         self.send_introductions(now);
         self.roll_back();
+        self.go_through();
         let mut stepped = 0;
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
         let mut due = due;

@@ -31,6 +31,11 @@ impl Rollback {
         self.past.place(tick).0.clone_from(&self.now);
     }
 
+    /// Remembers another copy for a tick up to the present one.
+    pub(crate) fn remember(&mut self, tick: Tick, copy: &BodyCopy) {
+        self.past.place(tick).0.clone_from(copy);
+    }
+
     /// The copy at a tick that is remembered.
     pub(crate) fn at(&self, tick: Tick) -> Option<&BodyCopy> {
         self.past.get(tick).filter(|_| tick <= self.tick)

@@ -39,7 +39,7 @@ impl Forecast {
 
     /// Extrapolates to `ahead` ticks after the newest sample. `samples` holds (ticks before the
     /// newest, values), with the newest first. Returns `None` without samples.
-    pub(crate) fn go_on(&self, samples: &[(u64, [f64; CHANNELS])], ahead: u64) -> Option<[f64; CHANNELS]> {
+    pub(crate) fn go_on<const N: usize>(&self, samples: &[(u64, [f64; N])], ahead: u64) -> Option<[f64; N]> {
         let (_, newest) = samples.first()?;
         if samples.len() < 4 {
             let Some((back, before)) = samples.get(1) else { return Some(*newest) };
@@ -50,7 +50,7 @@ impl Forecast {
         // Normal equations of a parabola in x = -back / window, which lies in [-1, 0].
         let scale = self.window as f64;
         let mut m = [0.0; 5];
-        let mut right = [[0.0; CHANNELS]; 3];
+        let mut right = [[0.0; N]; 3];
         for (back, values) in samples {
             let x = -(*back as f64) / scale;
             let mut power = 1.0;
@@ -69,7 +69,7 @@ impl Forecast {
         let (s, c) = self.paths(ahead);
         // The result is value + s * velocity (per tick) + c * acceleration (per tick squared).
         let weights = nalgebra::RowVector3::new(1.0, s / scale, 2.0 * c / (scale * scale)) * inverse;
-        let mut out = [0.0; CHANNELS];
+        let mut out = [0.0; N];
         for (w, right) in weights.iter().zip(&right) {
             for (o, r) in out.iter_mut().zip(right) {
                 *o += w * r;
@@ -131,7 +131,7 @@ mod tests {
     #[test]
     fn few_samples_and_gaps_are_enough() {
         let forecast = Forecast::new(0.025);
-        assert_eq!(forecast.go_on(&[], 3), None);
+        assert_eq!(forecast.go_on::<CHANNELS>(&[], 3), None);
         assert_eq!(forecast.go_on(&[(0, [2.0; CHANNELS])], 3), Some([2.0; CHANNELS]));
         let two = forecast.go_on(&[(0, [2.0; CHANNELS]), (2, [1.0; CHANNELS])], 1).unwrap();
         assert!((two[0] - 2.5).abs() < 0.01, "{two:?}");

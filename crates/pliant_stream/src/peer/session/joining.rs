@@ -8,6 +8,7 @@ use super::{
     PeerMessage, PeerSession, RemotePeer, UserId, WINDOW,
 };
 use crate::StreamError;
+use crate::wire::InputTick;
 
 impl PeerSession {
     /// Sets where the peer at a connection, and those to whom it passes it on, reach this peer,
@@ -187,24 +188,25 @@ impl PeerSession {
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
         // All peers received the same last input, or extrapolate the same hands a little further.
         // After that the hands are released.
-        if let Some(inputs) = self.inputs.users.get_mut(&user) {
-            inputs.gone = true;
-        }
-        if let Some(inputs) = self.inputs.users.get(&user) {
-            let from = inputs.highest + 1;
-            let again = self.rollback_from.unwrap_or(self.tick + 1).saturating_sub(from);
+        if let Some(last) = self.inputs.users.get(&user).and_then(|inputs| inputs.newest()).cloned() {
+            let from = last.tick + 1;
+            let bodies = self.changed_by(user, &InputTick { tick: from, ..InputTick::default() });
+            let again = self.ticks_again(&bodies, from);
             // Without a hand in its last input, nothing was extrapolated.
-            if let Some(last) = inputs.newest().filter(|last| again > 0 && !last.held.is_empty()) {
+            if again > 0 {
                 // The user pays for the ticks as for a late input. Otherwise a state repairs all.
-                let cost = late_cost((&self.bodies, &self.inputs), last, again);
+                let cost = late_cost((&self.bodies, &self.inputs), &last, again);
                 if other.pays_for_late(&mut self.shared, self.updated, cost) {
-                    self.rollback_from = Some(from);
+                    self.mark(&bodies, from);
                 } else {
                     self.others.values_mut().for_each(|o| o.lost = true);
                 }
             }
-            self.inputs.forget_gone(self.tick);
         }
+        if let Some(inputs) = self.inputs.users.get_mut(&user) {
+            inputs.gone = true;
+        }
+        self.inputs.forget_gone(self.tick);
         self.introductions.forget(user);
         self.away.keep(user, other.budgets);
         self.event(PeerEvent::Left { user, reason });

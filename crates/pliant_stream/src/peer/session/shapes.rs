@@ -158,10 +158,10 @@ impl PeerSession {
         }
         // A set that is made already, and came too late, is like a late input.
         let first = from.max(self.taken + 1);
-        let again = self.rollback_from.unwrap_or(tick + 1).saturating_sub(first);
+        let again = (known.settled() + 1).saturating_sub(first);
         let cost = late_cost((&self.bodies, &self.inputs), &InputTick::default(), again);
         if again == 0 || other.pays_for_late(&mut self.shared, now, cost) {
-            self.rollback_from = Some(self.rollback_from.map_or(first, |before| before.min(first)));
+            self.mark(&[body], first);
         } else {
             other.lost = true;
         }

@@ -97,8 +97,7 @@ impl PeerSession {
 
     /// Only checks of peers with a lower number count.
     pub(super) fn compare(&mut self, peer: PeerId, user: UserId, check: StateCheck) {
-        let unsettled = self.rollback_from.is_some_and(|from| from <= check.tick);
-        if user > self.config.user || unsettled || check.tick > self.confirmed() {
+        if user > self.config.user || check.tick > self.confirmed() {
             return;
         }
         // What waits for shapes differs until it has them.
@@ -134,7 +133,7 @@ impl PeerSession {
             self.others.iter().filter(|(_, o)| o.wants_state && o.user.is_some()).map(|(p, _)| *p).collect();
         // A peer that has just joined has no inputs yet and must not hold the confirmed tick back.
         let each = self.inputs.users.values().filter(|u| !u.gone && u.first <= self.tick);
-        let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.tick);
+        let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.settled());
         if wanting.is_empty() || tick == 0 || self.out.len() >= MAX_OUT {
             return;
         }
