@@ -77,7 +77,7 @@ fn a_guest_of_few_modes_gets_all_coordinates_of_a_reduced_body() {
     for recovery in [RecoveryConfig::default(), RecoveryConfig::paper()] {
         let [whole, thin] = [None, few].map(|modes| {
             let link = LinkConfig { loss: Loss::None, ..LinkConfig::preset(Preset::Paper1) };
-            let own = Experiment::new(model.clone(), link, recovery.clone());
+            let own = Experiment::new(model.clone(), link, recovery);
             let run = Experiment { elasticity: Elasticity::Reduced, modes, seconds: 10.0, ..own }.run();
             run.unwrap()
         });
