@@ -142,7 +142,6 @@ export async function until(browser, what, so) {
   const began = performance.now();
   let last = "";
   while (performance.now() - began < LONGEST && !browser.crashed) {
-    // A browser that does not answer is no answer.
     try {
       if (await so()) return (performance.now() - began) / 1000;
       last = "";

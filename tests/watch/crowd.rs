@@ -131,7 +131,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let due = |heard: &Heard| {
         let first = if heard.count > 0 { heard.first } else { oldest };
         let silent = (newest - heard.last) as f64 * step > 1.0;
-        ((if silent { newest } else { heard.last }) - first) / every + 1
+        (if silent { newest } else { heard.last }).saturating_sub(first) / every + 1
     };
     let missing: u64 = all.map(|heard| due(heard).saturating_sub(heard.count)).sum();
     let mut costs = String::new();

@@ -3,7 +3,7 @@
 # the delay and the missing frames of the watchers, all on this machine over loopback. Prints a line
 # of JSON for each number of watchers, then the host's lines of the measured time.
 #
-#   tests/watch/load.sh BODY.modal [SECONDS [WATCHERS...]]
+#   tests/watch/load.sh BODY.modal [WHOLE_SECONDS [WATCHERS...]]
 #
 # RELAYS=2: two relays, of which the second fetches from the first, with half of the watchers each.
 # RATE: frames a second, 30 by default. AS: a command that runs the host, such as nice -n -5. In a

@@ -558,7 +558,8 @@ fn a_hand_feels_no_kick_when_another_takes_hold_or_lets_go() {
         }
         let settled = norm(minus(last, before)) / whole;
         println!("{what}: {:.2} % a step, {:.2} % in the end", 100.0 * most / whole, 100.0 * settled);
-        assert!(most / whole < 0.25 * settled + 0.01, "{what}: {most} of {whole} N");
+        assert!(settled > 0.02, "{what}: too little changes to see a kick");
+        assert!(most / whole < 0.25 * settled + 0.002, "{what}: {most} of {whole} N");
     };
     let other = body.grab(&patch([0.5, 0.0, 0.15]), GrabConfig::default()).unwrap();
     rest(&mut body, "another takes hold");

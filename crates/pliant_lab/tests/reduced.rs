@@ -86,7 +86,9 @@ fn a_guest_of_few_modes_gets_all_coordinates_of_a_reduced_body() {
             whole.rms_percent, thin.rms_percent, whole.bytes_per_frame, thin.bytes_per_frame
         );
         assert!(thin.rms_percent < 2.0 * whole.rms_percent.max(0.05), "{}", thin.rms_percent);
-        assert!(thin.bytes_per_frame <= whole.bytes_per_frame);
+        // Accelerations of all coordinates are in each frame.
+        let most = if recovery == RecoveryConfig::default() { 0.99 } else { 1.0 };
+        assert!(thin.bytes_per_frame <= most * whole.bytes_per_frame);
     }
 }
 

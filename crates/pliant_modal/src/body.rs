@@ -420,7 +420,9 @@ impl Body {
             // A hand has no velocity in the first step of its grab.
             let way = grab.last_target.map_or_else(Vector3::zeros, |last| grab.target - last);
             // Below a nanometer nothing is left, so that a body at rest may sleep.
-            grab.slip = if grab.slip.norm() > 1e-9 { fade * grab.slip } else { Vector3::zeros() };
+            let slip = if grab.slip.norm() > 1e-9 { fade * grab.slip } else { Vector3::zeros() };
+            let way = way + slip - grab.slip;
+            grab.slip = slip;
             let (target, config) = (grab.target + grab.slip, grab.config);
             hand.hold = Hold::Target { target, velocity: way / self.config.step, config };
             grab.last_target = Some(grab.target);

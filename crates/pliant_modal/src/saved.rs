@@ -154,8 +154,9 @@ impl Body {
             }
         }
         body.set_held_shapes(shapes)?;
+        let size = body.model().size();
         for (grab, hand) in body.grabs.iter_mut().zip(&saved.hands) {
-            grab.slip = hand.slip.into();
+            grab.slip = Vector3::from(hand.slip).cap_magnitude(size);
         }
         let columns = body.held_shapes().map_or(0, |shapes| shapes.columns());
         let mut state = saved.state.clone();

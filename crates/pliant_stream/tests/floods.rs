@@ -145,7 +145,10 @@ fn a_goodbye_is_heard_also_when_others_flood_before_the_events_are_taken() {
     assert_eq!((events.iter().filter(left).count(), events.iter().filter(let_go).count()), (1, 1));
     // The newest movements of all are there.
     for user in host.users().map(|(_, user, _)| user).take(HOLDERS as usize) {
-        let last = |event: &HostEvent| matches!(event, HostEvent::GrabMoved { key, input: 999, .. } if key.user == user);
+        let last = |event: &HostEvent| match event {
+            HostEvent::GrabMoved { key, input, .. } => key.user == user && *input == 999,
+            _ => false,
+        };
         assert!(events.iter().any(last), "{user:?}");
     }
 }

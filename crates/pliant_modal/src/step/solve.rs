@@ -3,7 +3,8 @@
 /// Workspace of the solve. It grows when hands are added.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct System {
-    /// Matrix in row-major order, `n x n`. Of a symmetric one, the upper triangle.
+    /// Matrix in row-major order, `n x n`. Of a symmetric one, the upper triangle, which is set as
+    /// the lower one.
     matrix: Vec<f64>,
     right: Vec<f64>,
     /// Workspace: a sum for each column.

@@ -24,13 +24,16 @@ impl<T> Events<T> {
         self.push_sparing(event, |_| true);
     }
 
-    /// As [`Events::push`], but a full queue drops its oldest event that `can_go`, while there is
-    /// one.
+    /// As [`Events::push`], but a full queue drops its oldest event that `can_go`, or the new one.
+    /// Where none can go, it drops the oldest.
     pub(crate) fn push_sparing(&mut self, event: T, can_go: impl Fn(&T) -> bool) {
         if self.waiting.len() >= MAX {
-            let oldest = self.waiting.iter().position(can_go).unwrap_or(0);
-            self.waiting.remove(oldest);
             self.dropped += 1;
+            match self.waiting.iter().position(&can_go) {
+                Some(oldest) => drop(self.waiting.remove(oldest)),
+                None if can_go(&event) => return,
+                None => drop(self.waiting.pop_front()),
+            }
         }
         self.waiting.push_back(event);
     }
@@ -60,6 +63,9 @@ mod tests {
         assert_eq!(events.pop(), Some(0), "all odd ones are gone, and all even ones are there");
         (0..2).for_each(|_| events.push_sparing(0, odd));
         assert_eq!(events.pop(), Some(4), "where none can go, the oldest does");
-        assert_eq!((events.dropped(), events.waiting.len()), (MAX as u64 / 2 + 1, MAX - 1));
+        events.push_sparing(0, odd);
+        events.push_sparing(1, odd);
+        assert_eq!((events.pop(), events.waiting.back()), (Some(6), Some(&0)), "the new one goes first");
+        assert_eq!((events.dropped(), events.waiting.len()), (MAX as u64 / 2 + 2, MAX - 1));
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! Peers step alike only with the same shapes at the same tick. The peer with the lowest number
 //! says which these are. Every peer makes them itself, beside its ticks, because they are the same
-//! on every machine. A set that is made after its tick is like a late input: the peer rolls back.
+//! on every machine. A set that is made after its tick is like a late input.
 
 use std::sync::Arc;
 

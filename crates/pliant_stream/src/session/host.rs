@@ -78,7 +78,8 @@ impl HostBody {
     /// Returns what a subscription means for this body.
     ///
     /// Of a body with reduced elasticity a stream has all modes, because without those that shorten
-    /// it a body hardly bends. Who asks for fewer gets them refreshed more rarely.
+    /// it a body hardly bends. Who asks for fewer gets them refreshed more rarely. A stream of
+    /// accelerations, which has all of them in each frame, then has as many bytes as without.
     fn subscribed(&self, mut subscription: StreamSubscription) -> StreamSubscription {
         let modes = self.model.mode_count().min(usize::from(u16::MAX)) as u16;
         if self.settings.is_reduced(&self.model) && subscription.modes < modes {
@@ -464,14 +465,14 @@ fn step_up(modes: u16) -> u16 {
 /// carries. The result is `None` when the guest takes nothing of the body.
 pub(super) fn stream_key(peer: &GuestPeer, body: &HostBody) -> Option<StreamKey> {
     let model_modes = body.model.mode_count();
-    let mut subscription = peer.regulator.cut(peer.subscription?, model_modes);
+    let mut subscription = peer.subscription?;
     if let Some(&most) = peer.interest.get(&body.id) {
         if most == 0 {
             return None;
         }
         subscription.modes = subscription.modes.min(step_up(most));
     }
-    subscription = body.subscribed(subscription);
+    subscription = peer.regulator.cut(body.subscribed(subscription), model_modes);
     subscription.modes = Encoder::modes_for(&subscription, model_modes, peer.link.max_datagram) as u16;
     Some((subscription, peer.link.max_datagram))
 }

@@ -75,7 +75,10 @@ impl PeerBody {
             self.compensate(from, inputs);
             self.visual.add(&self.model, &before, &self.rollback.now.state);
         } else {
-            self.pass = Some(Pass { tick: base, copy: None });
+            // Equations (8) and (9) leave approximate states, which are never taken for equal.
+            let exact = self.repair != LateInputRepair::Compensate;
+            let copy = if exact { None } else { self.rollback.at(base).cloned() };
+            self.pass = Some(Pass { tick: base, copy });
         }
         true
     }

@@ -66,12 +66,15 @@ impl PeerSession {
 
     /// The number of ticks that are gone through again if one changes for some bodies.
     pub(super) fn ticks_again(&self, bodies: &[BodyId], tick: Tick) -> u64 {
+        let tick = tick.max(self.taken + 1);
         let settled = bodies.iter().filter_map(|id| self.bodies.get(id)).map(PeerBody::settled);
         settled.max().map_or(0, |settled| (settled + 1).saturating_sub(tick))
     }
 
-    /// Marks a tick that has changed for some bodies.
+    /// Marks a tick that has changed for some bodies. What is before the last state that was taken
+    /// stays as the state had it.
     pub(super) fn mark(&mut self, bodies: &[BodyId], tick: Tick) {
+        let tick = tick.max(self.taken + 1);
         if tick <= self.tick {
             for id in bodies {
                 if let Some(body) = self.bodies.get_mut(id) {
@@ -173,7 +176,7 @@ pub(super) fn late_cost(
     input: &InputTick,
     ticks: u64,
 ) -> [f64; 2] {
-    // All bodies are stepped again, and a step with contacts takes as long as several without.
+    // A step with contacts takes as long as several without, whichever body has them.
     let touches = bodies.values().any(PeerBody::touches);
     let done = input.held.len() + input.impulses.len();
     let own = 1 + done as u64 + if touches { CONTACT_COST } else { 0 };

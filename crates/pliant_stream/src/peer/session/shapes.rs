@@ -54,8 +54,8 @@ impl PeerSession {
     /// Takes shapes that were due ([`PeerSession::shapes_to_make`]); `None` where none can be made.
     /// Shapes of other places are ignored, and those of another model act as none.
     ///
-    /// Where their tick has passed, the body rolls back to it, and where it is not remembered any
-    /// more, this peer requests a state.
+    /// Where their tick has passed, the body goes through its ticks again from there, and where it
+    /// is not remembered any more, this peer requests a state.
     pub fn take_shapes(&mut self, body: BodyId, places: &[HeldPlace], shapes: Option<Arc<HeldShapes>>) {
         let leads = self.leads();
         // Late inputs that are known by now come first.
