@@ -106,7 +106,9 @@ fn the_force_in_two_hands_that_tear_shear_and_turn_a_free_body_is_that_of_the_fu
         let [a, b] = [0, 1].map(|i| slow.reaction(grabs[i]).unwrap());
         let apart = norm(std::array::from_fn(|k| a[k] + b[k])) / size;
         println!("{name}: {size:.2} N, off by {off:.5}, both hands differ by {apart:.1e}");
-        assert!(off < bound && apart < 1e-6, "{name}: {off} {apart}");
+        // What the hands differ by moves the body: a swing about the line between them, which
+        // nothing damps.
+        assert!(off < bound && apart < 1e-5, "{name}: {off} {apart}");
     }
 }
 

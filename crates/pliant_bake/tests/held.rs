@@ -514,6 +514,8 @@ fn a_body_of_which_one_of_two_hands_lets_go_gains_little_and_only_with_its_new_s
             println!(
                 "{name} at {rate} Hz: {before:.4} J, with new shapes {at_once:.4}, then at most {most:.4}"
             );
+            assert!(at_once < 1.2 * before, "{name}: {before} J, with new shapes {at_once}");
+            assert!(most < 1.001 * before.max(at_once), "{name}: {before} J, {at_once}, then {most}");
         }
     }
 }
