@@ -62,13 +62,13 @@ fn conditions() -> [Condition; 4] {
             bars(0.065, 3.6, 0.18, 1.01, 0),
             bars(0.021, 3.6, 0.055, 1.01, 0),
         ),
-        // Blackouts of 20 ticks and more occur in ten minutes. After one, the guest waits until it
-        // knows whether the host has paused, and some data comes too late.
+        // Blackouts of 20 ticks and more occur in ten minutes. After one, the removal of the error
+        // of the extrapolated force shows in the reaction, and some data comes too late.
         of(
             "gilbert:4",
             paper1(Loss::gilbert(0.09, 4.0, tick)),
             bars(0.35, 10.0, 1.0, 1.01, 0),
-            bars(0.62, 58.0, 1.3, 1.01, 40),
+            bars(0.5, 45.0, 4.2, 2.3, 40),
         ),
         of(
             "every:50",
