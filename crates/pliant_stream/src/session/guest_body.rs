@@ -24,6 +24,8 @@ const REQUEST_WITHIN: u64 = 200;
 const CATCH_UP: u64 = 120;
 /// Silence after which the host may have paused.
 const QUIET: Duration = Duration::from_millis(100);
+/// Ticks that a host is behind the time of a silence if it has paused.
+const PAUSED: f64 = 2.0;
 
 #[derive(Debug, Clone, Copy, Default)]
 struct TickRequest {
@@ -345,6 +347,9 @@ impl StreamedBody {
         if !frame.resent && frame.tick > highest {
             self.playout.arrived(now, frame.tick);
             let stands = matches!(self.config.policy, Policy::ForceDriven { .. }) && quiet > QUIET;
+            // Where as many ticks have passed as time, the network was silent and not the host.
+            let passed = (frame.tick - highest) as f64 * self.newmark.h;
+            let stands = stands && quiet.as_secs_f64() > passed + PAUSED * self.newmark.h;
             self.waits_for = if stands { LATE_ROW } else { self.waits_for.saturating_sub(1) };
         }
         // Messages may arrive before earlier frames. These wake nobody.
