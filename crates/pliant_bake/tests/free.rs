@@ -98,6 +98,8 @@ fn the_force_in_two_hands_that_tear_shear_and_turn_a_free_body_is_that_of_the_fu
         let full = deflect(mesh, &config(), Material::NeoHookean, &loads).unwrap();
         let (mut slow, grabs) = held(model, &patches, 1.0 / 60.0, 30.0);
         lead(&mut slow, &grabs, &ways, 10.0);
+        // The hands differ by what still moves the body along the line between them.
+        (0..600).for_each(|_| drop(slow.step().unwrap()));
         let size = norm(full.reactions[0]);
         let mut off = 0.0f64;
         for (grab, want) in grabs.iter().zip(&full.reactions) {
@@ -106,9 +108,7 @@ fn the_force_in_two_hands_that_tear_shear_and_turn_a_free_body_is_that_of_the_fu
         let [a, b] = [0, 1].map(|i| slow.reaction(grabs[i]).unwrap());
         let apart = norm(std::array::from_fn(|k| a[k] + b[k])) / size;
         println!("{name}: {size:.2} N, off by {off:.5}, both hands differ by {apart:.1e}");
-        // What the hands differ by moves the body: a swing about the line between them, which
-        // nothing damps.
-        assert!(off < bound && apart < 1e-5, "{name}: {off} {apart}");
+        assert!(off < bound && apart < 1e-6, "{name}: {off} {apart}");
     }
 }
 
