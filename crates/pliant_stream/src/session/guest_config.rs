@@ -17,8 +17,8 @@ pub struct GuestSessionConfig {
     /// Loss repair. Default: [`RecoveryConfig::default`].
     pub recovery: RecoveryConfig,
     /// Largest number of modes of each body that the guest receives, for slow machines and narrow
-    /// links. Of a body with reduced elasticity all come, refreshed the more rarely. Accelerations of all are
-    /// in each frame. Default: all.
+    /// links. Of a body with reduced elasticity all come, refreshed the more rarely. Accelerations
+    /// of all are in each frame. Default: all.
     pub modes: Option<u16>,
     /// Steps a newer copy of each body that this guest holds, in which the guest's own hands do not
     /// wait for the round trip; see
