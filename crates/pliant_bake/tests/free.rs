@@ -99,7 +99,9 @@ fn the_force_in_two_hands_that_tear_shear_and_turn_a_free_body_is_that_of_the_fu
         let (mut slow, grabs) = held(model, &patches, 1.0 / 60.0, 30.0);
         lead(&mut slow, &grabs, &ways, 10.0);
         // The hands differ by what still moves the body along the line between them.
-        (0..600).for_each(|_| drop(slow.step().unwrap()));
+        for _ in 0..600 {
+            slow.step().unwrap();
+        }
         let size = norm(full.reactions[0]);
         let mut off = 0.0f64;
         for (grab, want) in grabs.iter().zip(&full.reactions) {
