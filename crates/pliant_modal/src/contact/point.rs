@@ -116,8 +116,9 @@ pub(crate) struct ContactPoint {
     /// Way of the other surface in the step, m, world axes.
     pub(crate) carried: Vector3<f64>,
     pub(crate) anchor: Vector3<f64>,
-    /// Force at the end of the step before, N, world axes.
+    /// Force at the end of the step before, N, world axes, and the energy in the compliance then, J.
     pub(crate) before: Vector3<f64>,
+    pub(crate) stored_before: f64,
     /// Gap at the beginning of the step and the smallest gap allowed at its end, m.
     pub(crate) gap: f64,
     pub(crate) floor: f64,
@@ -170,6 +171,7 @@ impl ContactPoint {
             carried: zero,
             anchor: zero,
             before: zero,
+            stored_before: 0.0,
             gap: 0.0,
             floor: 0.0,
             passed: false,

@@ -58,7 +58,7 @@ impl<P: Member> Group<'_, P> {
         let mut recovered = 0.0;
         for point in &work.points {
             let force = point.world_force();
-            let (now, before) = (point.stored(&force), point.stored(&point.before));
+            let (now, before) = (point.stored(&force), point.stored_before);
             scale += now + before;
             gained += now - before;
             // What pushes a body out that was set into something.
@@ -167,6 +167,7 @@ pub(super) fn gained(work: &Touching, recovers: bool) -> bool {
     for point in &work.points {
         let force = point.world_force();
         let along = force.dot(&(point.end - point.start - point.carried));
+        // A dent that turns with the site is no work of the contact.
         let (stored, before) = (point.stored(&force), point.stored(&point.before));
         done += along + stored - before;
         scale += along.abs() + stored + before;

@@ -123,6 +123,7 @@ pub(super) fn resume(
     point.turn(normal);
     point.pushed = point.axes * force;
     point.force = point.pushed;
+    point.stored_before = point.stored(&force);
     let dent = point.compliance * force;
     point.gap += normal.dot(&dent);
     let unslipped = point.start + dent + carried;
