@@ -35,14 +35,18 @@ pids=""
 stop() { for pid in $pids; do kill "$pid" 2>/dev/null; done; wait; pids=""; }
 trap 'stop; rm -rf "$work"' EXIT
 trap 'exit 130' INT TERM HUP
+# A folder of their own: a relay reads its certificate anew after each change beside it, and says
+# so, and a log there is such a change.
+tls="$work/tls"
+mkdir "$tls"
 openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 10 -subj /CN=localhost \
-    -addext subjectAltName=IP:127.0.0.1 -keyout "$work/key" -out "$work/certificate" 2>/dev/null || exit 2
-hash=$(openssl x509 -in "$work/certificate" -outform der | openssl dgst -sha256 -r | cut -d' ' -f1)
+    -addext subjectAltName=IP:127.0.0.1 -keyout "$tls/key" -out "$tls/certificate" 2>/dev/null || exit 2
+hash=$(openssl x509 -in "$tls/certificate" -outform der | openssl dgst -sha256 -r | cut -d' ' -f1)
 start() { # port, more arguments
     port=$1
     shift
-    "$relay" --listen "127.0.0.1:$port" --listen-tls-cert "$work/certificate" \
-        --listen-tls-key "$work/key" --auth-public '**' "$@" >>"$work/relay.log" 2>&1 &
+    "$relay" --listen "127.0.0.1:$port" --listen-tls-cert "$tls/certificate" \
+        --listen-tls-key "$tls/key" --auth-public '**' "$@" >>"$work/relay.log" 2>&1 &
     pids="$pids $!"
 }
 first=${RELAY_PORT:-4460}

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { execFileSync, spawnSync } from "node:child_process";
 import { createHash } from "node:crypto";
-import { existsSync } from "node:fs";
+import { existsSync, mkdirSync } from "node:fs";
 import { createServer as createHttpServer } from "node:http";
 import { createServer as listen } from "node:net";
 import { join } from "node:path";
@@ -29,7 +29,10 @@ execFileSync(join(BIN, "pliant"), ["watch-page", site], limits);
 const pageAddress = await serve(site);
 
 // A certificate that lives longer than a relay: browsers take those of two weeks at most by their hash.
-const [key, certificate] = [join(WORK, "key.pem"), join(WORK, "certificate.pem")];
+// In a folder of its own: a relay reads it anew after each change beside it.
+const tls = join(WORK, "tls");
+mkdirSync(tls);
+const [key, certificate] = [join(tls, "key.pem"), join(tls, "certificate.pem")];
 const names = "subjectAltName=IP:127.0.0.1,DNS:localhost";
 const request = ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"];
 const about = ["-days", "10", "-subj", "/CN=localhost", "-addext", names, "-keyout", key, "-out", certificate];
