@@ -25,6 +25,9 @@ use std::time::{Duration, Instant};
 
 use pliant::net::watch::{RelayOptions, WatchEvent, Watcher};
 
+/// Watchers on a thread. Each has a connection and a socket of its own.
+const A_THREAD: usize = 50;
+
 /// What one watcher hears.
 #[derive(Default)]
 struct Heard {
@@ -57,14 +60,18 @@ fn main() -> Result<(), Box<dyn Error>> {
     let relays: Vec<&str> = relays.split(',').collect();
     let began = Instant::now();
     let mut crowd = Vec::new();
-    for k in 0..watchers {
-        let mut options = RelayOptions::new(relays[k % relays.len()], name);
-        if certificate != "system" {
-            options = options.with_certificate(certificate).ok_or("CERTIFICATE is no hash")?;
-        }
-        crowd.push((Instant::now(), Watcher::open(&options, vec![model.clone()])?, Heard::default()));
+    let options = relays.iter().map(|relay| match certificate.as_str() {
+        "system" => Ok(RelayOptions::new(*relay, name)),
+        hash => RelayOptions::new(*relay, name).with_certificate(hash).ok_or("CERTIFICATE is no hash"),
+    });
+    let options = options.collect::<Result<Vec<_>, _>>()?;
+    let all: Vec<RelayOptions> = options.iter().cycle().take(watchers).cloned().collect();
+    for some in all.chunks(A_THREAD) {
+        let opened = Instant::now();
+        let watchers = Watcher::open_all(some, vec![model.clone()])?;
+        crowd.extend(watchers.into_iter().map(|watcher| (opened, watcher, Heard::default())));
         // Not all handshakes in one moment.
-        sleep(Duration::from_millis(5));
+        sleep(Duration::from_millis(5 * some.len() as u64));
     }
     let (mut step, mut every) = (0.0, 1);
     // A few seconds until everybody has the first picture, then the measured time.

@@ -28,7 +28,7 @@ if [ -z "${BIN:-}" ]; then
     BIN=$(cargo metadata --format-version 1 --no-deps |
         sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
 fi
-# Each watcher has a socket and a loop of its own.
+# Each watcher has a socket of its own.
 ulimit -n "$(ulimit -Hn)"
 work=$(mktemp -d)
 pids=""

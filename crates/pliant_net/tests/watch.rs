@@ -143,12 +143,19 @@ fn the_session_comes_through(at: RelayOptions) {
     assert!(DVec3::from(hand.hands[0].target).distance(DVec3::Y) < 3.0);
     assert!(seen.hands.iter().flat_map(|h| &h.hands).any(|h| DVec3::from(h.reaction).length() > 0.1));
 
-    // Who comes late begins with the newest group.
-    let mut late = Watcher::open(&at, Vec::new()).unwrap();
+    // Who comes late begins with the newest group. Of two on one thread, one leaves early.
+    let mut pair = Watcher::open_all(&[at.clone(), at.clone()], Vec::new()).unwrap();
+    let (mut leaves, mut late) = (pair.pop(), pair.pop().unwrap());
     let (mut seen_late, opened) = (Seen::default(), tick(&host.app));
-    wait_for("a late watcher's frames", || {
+    let mut seen_by_other = Seen::default();
+    wait_for("late watchers' frames", || {
         host.update();
         seen.take(&mut watcher);
+        if let Some(other) = &mut leaves {
+            seen_by_other.take(other);
+            must!(seen_by_other.states.len() > 5, "{} frames", seen_by_other.states.len());
+        }
+        leaves = None;
         seen_late.take(&mut late);
         must!(seen_late.states.len() > 20, "{} frames", seen_late.states.len());
         Ok(())

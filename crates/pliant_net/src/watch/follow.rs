@@ -64,33 +64,67 @@ impl Watcher {
     /// # Errors
     /// [`WatchError`] for a relay's address or a session's name that is none.
     pub fn open(options: &RelayOptions, known: Vec<Arc<ModalModel>>) -> Result<Self, WatchError> {
-        let relay = options.open()?;
-        let name = options.session.clone();
+        let (watcher, followed) = Self::of(options)?;
+        start(vec![followed], known)?;
+        Ok(watcher)
+    }
+
+    /// Follows several sessions, or one several times, on one thread: what hundreds of watchers in
+    /// a process need. None waits for another, as long as their events are read.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open), for the first address or name that is none.
+    pub fn open_all(sessions: &[RelayOptions], known: Vec<Arc<ModalModel>>) -> Result<Vec<Self>, WatchError> {
+        let all = sessions.iter().map(Self::of).collect::<Result<Vec<_>, _>>()?;
+        let (watchers, followed) = all.into_iter().unzip();
+        start(followed, known)?;
+        Ok(watchers)
+    }
+
+    fn of(options: &RelayOptions) -> Result<(Self, Followed), WatchError> {
         let (to, events) = channel(QUEUE);
-        let setup = |error: std::io::Error| WatchError::Setup(error.to_string());
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(setup)?;
-        thread::Builder::new()
-            .name("pliant-watcher".into())
-            .spawn(move || {
-                let tasks = tokio::task::LocalSet::new();
-                runtime.block_on(tasks.run_until(async move {
-                    let closed = to.clone();
-                    tokio::select! {
-                        () = follow(relay, name, known, to) => {}
-                        () = closed.closed() => {}
-                    }
-                }));
-                drop(tasks);
-                runtime.shutdown_timeout(Duration::from_millis(500));
-            })
-            .map_err(setup)?;
-        Ok(Self { events })
+        Ok((Self { events }, Followed { relay: options.open()?, name: options.session.clone(), to }))
     }
 
     /// The next event, if there is one.
     pub fn poll(&mut self) -> Option<WatchEvent> {
         self.events.try_recv().ok()
     }
+}
+
+/// A session at a relay, and who is told of it.
+struct Followed {
+    relay: Relay,
+    name: String,
+    to: Sender<WatchEvent>,
+}
+
+/// Follows sessions on a thread of their own, each until its watcher is dropped.
+fn start(sessions: Vec<Followed>, known: Vec<Arc<ModalModel>>) -> Result<(), WatchError> {
+    let setup = |error: std::io::Error| WatchError::Setup(error.to_string());
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(setup)?;
+    let run = move || {
+        let tasks = tokio::task::LocalSet::new();
+        let followed = sessions.into_iter().map(|Followed { relay, name, to }| {
+            let (known, closed) = (known.clone(), to.clone());
+            tasks.spawn_local(async move {
+                tokio::select! {
+                    () = follow(relay, name, known, to) => {}
+                    () = closed.closed() => {}
+                }
+            })
+        });
+        let followed: Vec<_> = followed.collect();
+        runtime.block_on(tasks.run_until(async move {
+            for one in followed {
+                let _ = one.await;
+            }
+        }));
+        drop(tasks);
+        runtime.shutdown_timeout(Duration::from_millis(500));
+    };
+    thread::Builder::new().name("pliant-watcher".into()).spawn(run).map_err(setup)?;
+    Ok(())
 }
 
 /// A task that ends with its owner.
@@ -108,7 +142,7 @@ impl Drop for Owned {
     }
 }
 
-struct Followed {
+struct FollowedBody {
     body: CatalogBody,
     _task: Owned,
 }
@@ -125,7 +159,7 @@ struct Scene {
 
 async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sender<WatchEvent>) {
     let (producer, driver) = origin::Producer::new(origin::Config::default());
-    tokio::task::spawn_local(moq_net::time::run(driver));
+    let _driver = Owned::spawn(async move { drop(moq_net::time::run(driver).await) });
     let client = moq_net::Client::new().with_subscriber(producer.clone());
     let events = to.clone();
     let _connection = Owned::spawn(async move {
@@ -152,7 +186,7 @@ impl Scene {
     /// Follows the catalog, and with it the bodies, until the app is gone.
     async fn follow(&self) {
         let _hands = Owned::spawn(self.clone().follow_hands());
-        let mut bodies: BTreeMap<BodyId, Followed> = BTreeMap::new();
+        let mut bodies: BTreeMap<BodyId, FollowedBody> = BTreeMap::new();
         loop {
             if let Ok(mut track) = self.subscribe(CATALOG_TRACK, 3).await {
                 while let Ok(Some(mut group)) = track.next_group().await {
@@ -167,7 +201,7 @@ impl Scene {
         }
     }
 
-    async fn take(&self, catalog: Catalog, bodies: &mut BTreeMap<BodyId, Followed>) {
+    async fn take(&self, catalog: Catalog, bodies: &mut BTreeMap<BodyId, FollowedBody>) {
         let stays = |body: &CatalogBody| catalog.bodies.iter().any(|new| new == body);
         let gone: Vec<BodyId> = bodies.iter().filter(|(_, f)| !stays(&f.body)).map(|(id, _)| *id).collect();
         for id in gone {
@@ -181,7 +215,7 @@ impl Scene {
         self.send(WatchEvent::Catalog(catalog)).await;
         for body in new {
             let _task = Owned::spawn(self.clone().follow_body(body.clone()));
-            bodies.insert(body.id, Followed { body, _task });
+            bodies.insert(body.id, FollowedBody { body, _task });
         }
     }
 
