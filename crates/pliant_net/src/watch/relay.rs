@@ -10,7 +10,7 @@ use rustls::crypto::{CryptoProvider, verify_tls12_signature, verify_tls13_signat
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{CertificateError, DigitallySignedStruct, Error as TlsError, SignatureScheme};
 use thiserror::Error;
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, sleep, timeout};
 use url::{Host, Url};
 use web_transport_quinn::proto::ConnectRequest;
 
@@ -140,10 +140,14 @@ impl Relay {
             match timeout(CONNECT, self.connect(&client)).await {
                 Ok(Ok((session, driver))) => {
                     connected(true);
-                    pause = PAUSES[0];
+                    let since = Instant::now();
                     let end = moq_net::time::run(driver).await;
                     drop(session);
                     connected(false);
+                    // Relays refuse a token when the connection is already there.
+                    if since.elapsed() > PAUSES[1] {
+                        pause = PAUSES[0];
+                    }
                     tracing::debug!("the relay {} is lost: {end}", self.shown());
                 }
                 Ok(Err(error)) => tracing::debug!("the relay {} is not reached: {error}", self.shown()),
@@ -201,7 +205,7 @@ impl Relay {
 
 /// The time as the drivers of moq-net want it, by the clock of tokio.
 fn std_now() -> moq_net::time::Instant {
-    tokio::time::Instant::now().into_std()
+    Instant::now().into_std()
 }
 
 fn client_config(trust: &RelayTrust) -> Result<quinn::ClientConfig, WatchError> {
