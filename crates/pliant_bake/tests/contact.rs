@@ -524,8 +524,8 @@ fn a_body_that_two_walls_press_to_half_of_its_height_comes_back() {
             );
             assert!(most < 1.01 * held && fastest < 0.1, "{name} at {rate}: {most} {held} {fastest}");
             assert!(bent < 1e-3 && away < 1e-3, "{name} at {rate}: {bent} {away}");
-            // A miss: what each site yields besides the modes is taken for its own, so that the whole
-            // of a face yields too far, 1.6 times as far as `E A` says.
+            // A miss: what each site yields besides the modes is taken for its own, so that a whole
+            // face yields too far, 1.6 times as far as `E A` says.
             assert!((0.6..1.2).contains(&(held / plain)), "{name}: {held}");
         }
     }

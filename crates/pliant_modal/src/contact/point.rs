@@ -116,7 +116,8 @@ pub(crate) struct ContactPoint {
     /// Way of the other surface in the step, m, world axes.
     pub(crate) carried: Vector3<f64>,
     pub(crate) anchor: Vector3<f64>,
-    /// Force at the end of the step before, N, world axes, and the energy in the compliance then, J.
+    /// Force at the end of the step before, N, world axes, and the energy in the compliance then,
+    /// J.
     pub(crate) before: Vector3<f64>,
     pub(crate) stored_before: f64,
     /// Gap at the beginning of the step and the smallest gap allowed at its end, m.
