@@ -41,7 +41,7 @@ const BEGINNINGS: usize = 1;
 
 /// Way that the forces on a free body that hold each other would move it in a step if they had one
 /// direction, as a share of its size, from which on it is pressed.
-const PRESSED: f64 = 0.05;
+const PRESSED: f64 = 0.1;
 
 /// Way of a body's sites up to which it is not found where they are, as a share of its size.
 const SLACK: f64 = 1e-3;
