@@ -414,29 +414,23 @@ impl<P: Member> Group<'_, P> {
         }
     }
 
-    /// Whether the forces with which the step begins hold each other, and would move a free body
-    /// far if they did not.
+    /// Whether the forces with which the step of a free body alone begins hold each other, and would
+    /// move it far if they did not.
     ///
     /// Their arms are those of a state that is computed under them. An error of the arms by `x`
     /// turns the body such that they are off by about `h^2 sum |f| / (m size) x` in the next step.
     fn is_pressed(&self, work: &Touching) -> bool {
-        (0..self.len()).any(|member| {
-            let (mut sum, mut all) = (0.0, Vector3::zeros());
-            for point in &work.points {
-                let force = point.world_force();
-                if point.member == member {
-                    sum += force.norm();
-                    all += force;
-                } else if point.far.is_some_and(|far| far.member == member) {
-                    sum += force.norm();
-                    all -= force;
-                }
-            }
-            let view = self.view(member);
-            let (mass, size) = (view.kernel.model.mass(), view.kernel.model.size());
-            // What does not hold each other is a blow.
-            view.moves() && self.h * self.h * (sum - all.norm()) > PRESSED * mass * size
-        })
+        if self.len() != 1 || !self.view(0).moves() {
+            return false;
+        }
+        let (mut sum, mut all) = (0.0, Vector3::zeros());
+        for point in work.points.iter().filter(|point| point.member == 0) {
+            sum += point.pushed.norm();
+            all += point.world_force();
+        }
+        let model = &self.view(0).kernel.model;
+        // What does not hold each other is a blow.
+        self.h * self.h * (sum - all.norm()) > PRESSED * model.mass() * model.size()
     }
 
     /// Writes the rows of all points.
