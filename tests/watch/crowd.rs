@@ -8,10 +8,11 @@
 //! CERTIFICATE is the hash of the relays' certificate, or `system` for what the system trusts.
 //!
 //! Prints a line of JSON. Delays are behind the earliest arrival of any tick at any watcher, by the
-//! host's count of ticks: the path's own delay on loopback is not in them. A frame counts as
-//! missing if a watcher has heard an earlier and a later one. If it has heard nothing for the last
-//! second, all frames since its last one count too. Bytes and packets are all that crossed
-//! loopback: run it in a network namespace of its own where others use it too.
+//! host's count of ticks: the path's own delay on loopback is not in them. A frame that a watcher
+//! has not heard counts as missing if the watcher has heard an earlier frame and a later one. Where
+//! a watcher has heard nothing for the last second, the frames since its last one count, too. Bytes
+//! and packets are all that crossed loopback: run it in a network namespace of its own where others
+//! use it too.
 #![allow(missing_docs, reason = "a program for measurements")]
 
 #[path = "../../examples/session/mod.rs"]

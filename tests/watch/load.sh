@@ -12,22 +12,14 @@
 # Needs moq-relay 0.17.10 (PLIANT_MOQ_RELAY, or in PATH), openssl and Linux; ends with 77 (skipped)
 # without. Programs: those of BIN (a target folder's debug/ or release/), or built by cargo.
 set -u
-skip() { echo "skipped: $1"; exit 77; }
+. "$(dirname "$0")/common.sh"
 [ -r /proc/self/stat ] || skip "needs Linux"
-command -v openssl >/dev/null || skip "no openssl"
-relay=${PLIANT_MOQ_RELAY:-$(command -v moq-relay)}
-[ -x "$relay" ] || skip "no moq-relay (cargo install moq-relay --version 0.17.10)"
 body=$(realpath "${1:?which body}")
 seconds=${2:-20}
 [ $# -ge 2 ] && shift 2 || shift $#
 watchers=${*:-1 10 100}
 cd "$(dirname "$0")/../.."
-if [ -z "${BIN:-}" ]; then
-    cargo build --release -p pliant_examples --no-default-features --features watch \
-        --example dedicated_server --example watch_crowd || exit 2
-    BIN=$(cargo metadata --format-version 1 --no-deps |
-        sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
-fi
+build dedicated_server watch_crowd
 # Each watcher has a socket of its own.
 ulimit -n "$(ulimit -Hn)"
 work=$(mktemp -d)

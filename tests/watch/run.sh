@@ -12,22 +12,15 @@
 # cargo. OUT is a folder for the page's picture. Everything is on loopback, and takes a minute or
 # two; a step that takes too long ends it and says what was waited for.
 set -u
-skip() { echo "skipped: $1"; exit 77; }
 here=$(cd "$(dirname "$0")" && pwd)
-for program in node openssl; do
-    command -v $program >/dev/null || skip "no $program"
-done
-relay=${PLIANT_MOQ_RELAY:-$(command -v moq-relay)}
-[ -x "$relay" ] || skip "no moq-relay (cargo install moq-relay --version 0.17.10)"
+. "$here/common.sh"
+command -v node >/dev/null || skip "no node"
 chromium=${PLIANT_CHROMIUM:-$(command -v chromium || command -v chromium-browser || command -v google-chrome)}
 [ -x "$chromium" ] || skip "no Chromium"
 cd "$here/../.."
 if [ -z "${BIN:-}" ]; then
     cargo build --release -p pliant_cli || exit 2
-    cargo build --release -p pliant_examples --no-default-features --features watch \
-        --example dedicated_server --example watch_truth || exit 2
-    BIN=$(cargo metadata --format-version 1 --no-deps |
-        sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
+    build dedicated_server watch_truth
 fi
 work=$(mktemp -d)
 # Chromium's last processes may still write to its profile.

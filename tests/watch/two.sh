@@ -10,20 +10,12 @@
 # openssl; ends with 77 (skipped) where one is missing. Programs: those of BIN (a target folder's
 # debug/ or release/), or built by cargo. It takes a minute.
 set -u
-skip() { echo "skipped: $1"; exit 77; }
-command -v openssl >/dev/null || skip "no openssl"
-relay=${PLIANT_MOQ_RELAY:-$(command -v moq-relay)}
-[ -x "$relay" ] || skip "no moq-relay (cargo install moq-relay --version 0.17.10)"
+. "$(dirname "$0")/common.sh"
 moq=${PLIANT_MOQ:-$(command -v moq)}
 [ -x "$moq" ] || skip "no moq (cargo install moq-cli --version 0.14.10)"
 body=$(realpath "${1:?which body}")
 cd "$(dirname "$0")/../.."
-if [ -z "${BIN:-}" ]; then
-    cargo build --release -p pliant_examples --no-default-features --features watch \
-        --example dedicated_server --example watch_crowd || exit 2
-    BIN=$(cargo metadata --format-version 1 --no-deps |
-        sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release
-fi
+build dedicated_server watch_crowd
 work=$(mktemp -d)
 pids=""
 trap 'for pid in $pids; do kill "$pid" 2>/dev/null; done; wait; rm -rf "$work"' EXIT
@@ -48,7 +40,7 @@ mkdir "$work/tls"
     # shellcheck disable=SC2086
     openssl req -x509 $curve -days 10 -subj /CN=authority -keyout ca.key -out ca.pem &&
         openssl req $curve -subj /CN=localhost -keyout privkey.pem -out request.pem &&
-        echo subjectAltName=DNS:localhost >names &&
+        echo subjectAltName=IP:127.0.0.1 >names &&
         openssl x509 -req -in request.pem -CA ca.pem -CAkey ca.key -CAcreateserial -days 10 \
             -extfile names -out fullchain.pem
 ) 2>/dev/null || exit 2
@@ -65,13 +57,13 @@ watcher=$(sign --subscribe 'lectures/*')
 late=$(sign --subscribe 'lectures/*' --expires $((now - 86400)))
 
 port=${RELAY_PORT:-4470}
-a="https://localhost:$port/"
-b="https://localhost:$((port + 1))/"
+a="https://127.0.0.1:$port/"
+b="https://127.0.0.1:$((port + 1))/"
 start() { # name, port, more arguments of the relay
     name=$1
     at=$2
     shift 2
-    run "$name" "$relay" --listen "[::]:$at" --listen-tls-cert "$work/tls/fullchain.pem" \
+    run "$name" "$relay" --listen "127.0.0.1:$at" --listen-tls-cert "$work/tls/fullchain.pem" \
         --listen-tls-key "$work/tls/privkey.pem" --auth-url "http://127.0.0.1:$((at + 2))/" \
         --cache-capacity 512MB "$@"
 }

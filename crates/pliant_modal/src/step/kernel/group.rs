@@ -417,8 +417,9 @@ impl<P: Member> Group<'_, P> {
     /// Whether the forces with which the step of a free body alone begins hold each other, and
     /// would move it far if they did not.
     ///
-    /// Their arms are those of a state that is computed under them. An error of the arms by `x`
-    /// turns the body such that they are off by about `h^2 sum |f| / (m size) x` in the next step.
+    /// Their arms are those of a state that is computed under them. An error of the arms turns the
+    /// body, and comes back in the arms of the next step, the larger the larger
+    /// `h^2 sum |f| / (m size)` is.
     fn is_pressed(&self, work: &Touching) -> bool {
         if self.len() != 1 || !self.view(0).moves() {
             return false;
