@@ -49,6 +49,11 @@ function say(text: string): void {
   status.textContent = text;
 }
 
+/** Says what is under way or wrong while there is no body to see: its line says that, and more. */
+function sayBefore(text: string): void {
+  if (!session?.bodies.size) say(text);
+}
+
 /** A body of the running session. */
 interface Watched {
   body: CatalogBody;
@@ -204,7 +209,7 @@ class Session {
         const assembler = new Assembler(body.surfaceBytes);
         for (let frame = await group.readFrame(); frame && !gone; frame = await group.readFrame()) {
           const whole = assembler.push(checked(frame.payload));
-          say(`model: ${Math.round(100 * assembler.progress)} %`);
+          sayBefore(`model: ${Math.round(100 * assembler.progress)} %`);
           if (!whole) continue;
           const surface = readSurface(whole);
           if (surface.model !== body.model) throw new WrongData("a surface is of another model");
@@ -300,7 +305,7 @@ function told(error: unknown): void {
   numbers.wrong++;
   lastWrong = tooLong ? "a frame is too long" : flood ? "a group comes faster than it is read" : found;
   if (wrongs.size < MAX_WRONGS) wrongs.add(lastWrong);
-  say(`The session sends what this page does not take: ${lastWrong}`);
+  sayBefore(`The session sends what this page does not take: ${lastWrong}`);
 }
 
 // For measurements: what was decoded, and a tick to hold the picture at.
