@@ -7,104 +7,26 @@
 #[path = "support/relay.rs"]
 mod relay;
 mod support;
+#[path = "support/watching.rs"]
+mod watching;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bevy::math::{DQuat, DVec3};
+use bevy::math::DVec3;
 use bevy::prelude::*;
 use moq_net::{Timestamp, origin};
-use pliant_body::{BodyState, Grab, GrabOf, PliantTick, VisualState};
+use pliant_body::VisualState;
 use pliant_modal::ModalModel;
 use pliant_net::watch::{
-    PublishOptions, RelayOptions, WatchCommands, WatchEvent, WatchPlugin, WatchState, WatchView, Watcher,
+    PublishOptions, RelayOptions, WatchCommands, WatchPlugin, WatchState, WatchView, Watcher,
 };
-use pliant_net::{HostConfig, NetHost, NetPlugin, RemoteHands};
-use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchHands, WatchSurface};
+use pliant_net::{NetHost, NetPlugin, RemoteHands};
+use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchSurface};
 use pliant_stream::{BodyId, Placement, TickState};
 use relay::{Certificate, TestRelay};
-use support::{TIP, alone, app, bar, body_of, host, must, run_until, tick, wait_for};
-
-const NAME: &str = "lectures/bar";
-
-fn options(relay: &TestRelay) -> RelayOptions {
-    RelayOptions::new(relay.address(), NAME).with_certificate(&relay.hash).unwrap()
-}
-
-/// A host that publishes at a relay, with a hand on its body that goes round.
-struct Publisher {
-    app: App,
-    body: Entity,
-    hand: Entity,
-    began: Instant,
-    /// The host's coordinates by tick.
-    truth: BTreeMap<u64, Vec<f64>>,
-}
-
-impl Publisher {
-    fn start(options: PublishOptions) -> Self {
-        let (mut app, _, body) = host(HostConfig::default());
-        // The host's session begins with the first frame.
-        app.update();
-        app.world_mut().resource_mut::<NetHost>().publish_to_watchers(options).unwrap();
-        let at = DVec3::Y + DQuat::from_rotation_z(0.5) * (2.0 * DVec3::new(0.9, 0.0, 0.0));
-        let hand = app.world_mut().spawn((Grab::new(TIP, 0.3, at), GrabOf(body))).id();
-        Self { app, body, hand, began: Instant::now(), truth: BTreeMap::new() }
-    }
-
-    fn update(&mut self) {
-        std::thread::sleep(Duration::from_millis(3));
-        let time = self.began.elapsed().as_secs_f64();
-        let off = DVec3::new(0.9, 0.2 * (3.0 * time).sin(), 0.15 * (2.0 * time).cos());
-        if let Some(mut grab) = self.app.world_mut().get_mut::<Grab>(self.hand) {
-            grab.target = DVec3::Y + DQuat::from_rotation_z(0.5) * (2.0 * off);
-        }
-        self.app.update();
-        let tick = self.app.world().resource::<PliantTick>().0;
-        let q = self.app.world().get::<BodyState>(self.body).unwrap().body().q().to_vec();
-        self.truth.insert(tick, q);
-    }
-}
-
-/// What a watcher has seen so far.
-#[derive(Default)]
-struct Seen {
-    catalogs: Vec<Catalog>,
-    models: BTreeMap<BodyId, Arc<ModalModel>>,
-    states: Vec<(u64, Vec<f64>)>,
-    hands: Vec<WatchHands>,
-    over: u32,
-    wrong: Vec<String>,
-    connected: u32,
-}
-
-impl Seen {
-    fn take(&mut self, watcher: &mut Watcher) {
-        while let Some(event) = watcher.poll() {
-            match event {
-                WatchEvent::Relay(connected) => self.connected += u32::from(connected),
-                WatchEvent::Catalog(catalog) => self.catalogs.push(catalog),
-                WatchEvent::Body(body, model) => drop(self.models.insert(body.id, model)),
-                WatchEvent::State(_, state) => self.states.push((state.tick, state.q)),
-                WatchEvent::Hands(hands) => self.hands.push(hands),
-                WatchEvent::Over => self.over += 1,
-                WatchEvent::Wrong(what) => self.wrong.push(what),
-                _ => {}
-            }
-        }
-    }
-}
-
-/// Largest difference of any vertex between two states, as a share of the body's size.
-fn off(model: &ModalModel, a: &[f64], b: &[f64]) -> f64 {
-    let vertices = model.surface().positions().len() as u32;
-    let apart = |v| {
-        let [a, b] = [a, b].map(|q| DVec3::from(model.vertex_position(v, q, true).unwrap()));
-        a.distance(b)
-    };
-    (0..vertices).map(apart).fold(0.0, f64::max) / model.size()
-}
+use support::{alone, app, bar, body_of, must, run_until, tick, wait_for};
+use watching::{NAME, Publisher, Seen, off, options};
 
 /// The whole way, through any relay: every frame is the host's shape at its tick, a late watcher
 /// sees the next frames, hands and numbers are those of the host, and the end is told.

@@ -1,6 +1,6 @@
 //! The watcher's side without an engine: follows a session at a relay.
 
-use std::cell::{Cell, RefCell};
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use super::relay::{Relay, RelayOptions, WatchError};
 
 /// Events that wait for the app. While they are full, nothing more is read from the relay.
 const QUEUE: usize = 1024;
-/// Most bytes of models of one session.
+/// Most bytes of the models of one session, as files.
 const MODELS: u64 = 256 << 20;
 /// How long an older group is waited for, where a newer one is there. Who comes late gets a group
 /// that ended within this time first.
@@ -36,7 +36,11 @@ const RETRY_PAUSE: Duration = Duration::from_millis(500);
 pub enum WatchEvent {
     /// The relay is connected, or is lost and tried again.
     Relay(bool),
-    /// The host's session is there, with another catalog than before.
+    /// Why the relay was lost or not reached. One that refuses a token is connected and lost at
+    /// once.
+    RelayError(String),
+    /// The host's session is there, with another catalog than before. A body in it may look
+    /// different from before, or be somewhere else.
     Catalog(Catalog),
     /// A body has its model.
     Body(CatalogBody, Arc<ModalModel>),
@@ -48,7 +52,7 @@ pub enum WatchEvent {
     Hands(WatchHands),
     /// The host's session is over, or its relay has lost it. It is waited for.
     Over,
-    /// The relay or the host has sent what is none. It was left out.
+    /// The relay or the host has sent something that is wrong. It was left out.
     Wrong(String),
 }
 
@@ -152,9 +156,75 @@ struct FollowedBody {
 struct Scene {
     broadcast: broadcast::Consumer,
     to: Sender<WatchEvent>,
-    models: Rc<RefCell<BTreeMap<ModelHash, Rc<OnceCell<Arc<ModalModel>>>>>>,
-    /// Bytes of models that were fetched or are being fetched.
-    fetched: Rc<Cell<u64>>,
+    models: Models,
+}
+
+/// The models that are there or are being fetched.
+#[derive(Clone, Default)]
+struct Models(Rc<RefCell<BTreeMap<ModelHash, FetchedModel>>>);
+
+#[derive(Default)]
+struct FetchedModel {
+    model: Rc<OnceCell<Arc<ModalModel>>>,
+    /// Length of the file. 0 for one that was known before.
+    bytes: u64,
+    /// Number of bodies that have it.
+    users: usize,
+}
+
+/// A body's part in a model.
+struct UsedModel {
+    models: Models,
+    hash: ModelHash,
+}
+
+impl Models {
+    /// The model of a body, there or not, for as long as what is returned is kept. Models that
+    /// nobody uses make room.
+    fn of_body(&self, body: &CatalogBody) -> Result<UsedModel, String> {
+        let mut models = self.0.borrow_mut();
+        if !models.contains_key(&body.model) {
+            if body.file_bytes == 0 {
+                return Err("the host does not publish the files of its models".into());
+            }
+            if body.file_bytes > MAX_MODEL as u64 {
+                return Err("a model is too large".into());
+            }
+            let mut sum = models.values().fold(body.file_bytes, |sum, model| sum.saturating_add(model.bytes));
+            models.retain(|_, model| {
+                let goes = sum > MODELS && model.users == 0 && model.bytes > 0;
+                sum -= if goes { model.bytes } else { 0 };
+                !goes
+            });
+            if sum > MODELS {
+                return Err("the session has too many models".into());
+            }
+            models.insert(body.model, FetchedModel { bytes: body.file_bytes, ..FetchedModel::default() });
+        }
+        let users = models.get_mut(&body.model).map(|model| &mut model.users);
+        users.into_iter().for_each(|users| *users += 1);
+        Ok(UsedModel { models: self.clone(), hash: body.model })
+    }
+}
+
+impl UsedModel {
+    /// The model and the length of its file.
+    fn model(&self) -> (Rc<OnceCell<Arc<ModalModel>>>, u64) {
+        let models = self.models.0.borrow();
+        models.get(&self.hash).map(|one| (one.model.clone(), one.bytes)).unwrap_or_default()
+    }
+}
+
+impl Drop for UsedModel {
+    fn drop(&mut self) {
+        let mut models = self.models.0.borrow_mut();
+        let Some(model) = models.get_mut(&self.hash) else { return };
+        model.users -= 1;
+        // One that is there is kept for when the host starts again, while there is room.
+        if model.users == 0 && model.model.get().is_none() {
+            models.remove(&self.hash);
+        }
+    }
 }
 
 async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sender<WatchEvent>) {
@@ -164,14 +234,22 @@ async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sen
     let events = to.clone();
     let _connection = Owned::spawn(async move {
         // An app that does not read learns of the relay from what arrives.
-        relay.keep(client, move |connected| drop(events.try_send(WatchEvent::Relay(connected)))).await;
+        let told = move |connection: Result<(), String>| {
+            drop(events.try_send(WatchEvent::Relay(connection.is_ok())));
+            if let Err(why) = connection {
+                drop(events.try_send(WatchEvent::RelayError(why)));
+            }
+        };
+        relay.keep(client, told).await;
     });
-    let models = known.into_iter().map(|model| (model.hash(), Rc::new(OnceCell::new_with(Some(model)))));
-    let models = Rc::new(RefCell::new(models.collect::<BTreeMap<_, _>>()));
+    let models = Models::default();
+    for model in known {
+        let (hash, model) = (model.hash(), Rc::new(OnceCell::new_with(Some(model))));
+        models.0.borrow_mut().insert(hash, FetchedModel { model, ..FetchedModel::default() });
+    }
     let consumer = producer.consume();
     while let Ok(broadcast) = consumer.routed_broadcast(name.as_str()).await {
-        let (models, fetched) = (models.clone(), Rc::new(Cell::new(0)));
-        let scene = Scene { broadcast: broadcast.clone(), to: to.clone(), models, fetched };
+        let scene = Scene { broadcast: broadcast.clone(), to: to.clone(), models: models.clone() };
         tokio::select! {
             _ = broadcast.closed() => {}
             () = scene.follow() => {}
@@ -202,7 +280,7 @@ impl Scene {
     }
 
     async fn take(&self, catalog: Catalog, bodies: &mut BTreeMap<BodyId, FollowedBody>) {
-        let stays = |body: &CatalogBody| catalog.bodies.iter().any(|new| new == body);
+        let stays = |body: &CatalogBody| catalog.bodies.iter().any(|new| body.goes_on_as(new));
         let gone: Vec<BodyId> = bodies.iter().filter(|(_, f)| !stays(&f.body)).map(|(id, _)| *id).collect();
         for id in gone {
             bodies.remove(&id);
@@ -239,9 +317,10 @@ impl Scene {
     }
 
     async fn follow_body(self, body: CatalogBody) {
-        let model = loop {
+        // Dropped with this task, when the body is gone.
+        let (_used, model) = loop {
             match self.model(&body).await {
-                Ok(model) => break model,
+                Ok(used) => break used,
                 Err(wrong) => self.send(WatchEvent::Wrong(wrong)).await,
             }
             tokio::time::sleep(4 * RETRY_PAUSE).await;
@@ -273,23 +352,16 @@ impl Scene {
     }
 
     /// The model of a body, fetched once for all bodies that have it.
-    async fn model(&self, body: &CatalogBody) -> Result<Arc<ModalModel>, String> {
-        let place = self.models.borrow_mut().entry(body.model).or_default().clone();
-        let model = place.get_or_try_init(|| self.fetch(body)).await?;
-        Ok(model.clone())
+    async fn model(&self, body: &CatalogBody) -> Result<(UsedModel, Arc<ModalModel>), String> {
+        let used = self.models.of_body(body)?;
+        let (place, bytes) = used.model();
+        let model = place.get_or_try_init(|| self.fetch(body.model, bytes)).await?.clone();
+        Ok((used, model))
     }
 
-    async fn fetch(&self, body: &CatalogBody) -> Result<Arc<ModalModel>, String> {
-        if body.file_bytes == 0 {
-            return Err("the host does not publish the files of its models".into());
-        }
-        let sum = self.fetched.get().saturating_add(body.file_bytes);
-        if sum > MODELS {
-            return Err("the session has too many models".into());
-        }
-        let mut assembler = decoded(Assembler::new(body.file_bytes, MAX_MODEL))?;
-        self.fetched.set(sum);
-        let mut track = self.subscribe(&model_track(body.model), 0).await.map_err(|e| e.to_string())?;
+    async fn fetch(&self, hash: ModelHash, bytes: u64) -> Result<Arc<ModalModel>, String> {
+        let mut assembler = decoded(Assembler::new(bytes, MAX_MODEL))?;
+        let mut track = self.subscribe(&model_track(hash), 0).await.map_err(|e| e.to_string())?;
         let group = track.next_group().await.map_err(|error| error.to_string())?;
         let mut group = group.ok_or("a model's track is empty")?;
         while let Some(frame) = group.read_frame().await.map_err(|error| error.to_string())? {
@@ -297,7 +369,7 @@ impl Scene {
             // A large model takes longer to read than frames may wait.
             let read = tokio::task::spawn_blocking(move || ModalModel::from_bytes(&bytes)).await;
             let model = read.map_err(|error| error.to_string())?.map_err(|error| error.to_string())?;
-            if model.hash() != body.model {
+            if model.hash() != hash {
                 return Err("a model is another one than the catalog says".into());
             }
             return Ok(Arc::new(model));

@@ -9,7 +9,7 @@ use bevy::platform::time::Instant;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalAsset, ModalBody, PliantDisplaySystems, VisualState};
 use pliant_modal::ModalModel;
-use pliant_stream::watch::{Catalog, CatalogBody, Playout, TickClock, WatchNumbers};
+use pliant_stream::watch::{Catalog, CatalogBody, HandsPlayout, Playout, TickClock, WatchHand, WatchNumbers};
 use pliant_stream::{BodyId, StepSettings};
 
 use super::WatchView;
@@ -47,8 +47,10 @@ pub struct WatchState {
     pub numbers: WatchNumbers,
     /// Number of frames that have arrived.
     pub frames: u64,
-    /// What arrived and was none: how often, and the last reason.
+    /// What arrived and was wrong: how often, and the last reason.
     pub wrong: (u64, String),
+    /// Why the relay was lost or not reached the last time. Empty if that was never so.
+    pub relay_error: String,
 }
 
 /// The session that this app watches.
@@ -58,6 +60,7 @@ pub(crate) struct Watched {
     began: Instant,
     clock: Option<TickClock>,
     bodies: BTreeMap<BodyId, WatchedBody>,
+    hands: HandsPlayout,
     scratch: Vec<f64>,
 }
 
@@ -87,6 +90,7 @@ impl WatchCommands for Commands<'_, '_> {
                     began: Instant::now(),
                     clock: None,
                     bodies: BTreeMap::new(),
+                    hands: HandsPlayout::default(),
                     scratch: Vec::new(),
                 }),
                 Err(error) => {
@@ -145,11 +149,15 @@ impl Watched {
     fn take(&mut self, world: &mut World, state: &mut WatchState, now: Duration, event: WatchEvent) {
         match event {
             WatchEvent::Relay(connected) => state.connected = connected,
+            WatchEvent::RelayError(why) => state.relay_error = why,
             WatchEvent::Catalog(catalog) => {
                 let same = |old: &Catalog| old.session == catalog.session && old.step == catalog.step;
                 if !state.catalog.as_ref().is_some_and(same) {
                     self.clear(world);
                     self.clock = Some(TickClock::new(catalog.step));
+                }
+                for body in &catalog.bodies {
+                    self.looks(world, body);
                 }
                 state.catalog = Some(catalog);
             }
@@ -170,27 +178,14 @@ impl Watched {
             }
             WatchEvent::Hands(hands) => {
                 state.numbers = hands.numbers;
-                for (id, body) in &self.bodies {
-                    let own = hands.hands.iter().filter(|hand| hand.body == *id);
-                    let new = own.map(|hand| RemoteHand {
-                        user: hand.key.user,
-                        // Watchers do not receive where on the surface a hand is.
-                        vertex: 0,
-                        target: DVec3::from(hand.target),
-                        reaction: DVec3::from(hand.reaction),
-                    });
-                    let new = RemoteHands(new.collect());
-                    if let Some(mut shown) = world.get_mut::<RemoteHands>(body.entity) {
-                        shown.set_if_neq(new);
-                    }
-                }
+                self.hands.push(hands);
             }
             WatchEvent::Over => {
                 self.clear(world);
                 state.catalog = None;
             }
             WatchEvent::Wrong(reason) => {
-                debug!("the watched session sends what is none: {reason}");
+                debug!("the watched session sends what is wrong: {reason}");
                 state.wrong = (state.wrong.0 + 1, reason);
             }
         }
@@ -207,8 +202,6 @@ impl Watched {
         let known = assets.iter().find(|(_, asset)| asset.0.hash() == model.hash()).map(|(id, _)| id);
         let known = known.and_then(|id| assets.get_strong_handle(id));
         let handle = known.unwrap_or_else(|| assets.add(ModalAsset::from(model)));
-        let [r, g, b, a] = body.color.map(|part| f32::from(part) / 255.0);
-        let view = WatchView { color: Srgba::new(r, g, b, a), hidden: false };
         let new = ModalBody::new(handle);
         let settings = StepSettings { warp: body.warps, ..new.settings };
         let entity = world
@@ -219,33 +212,70 @@ impl Watched {
                 Driven::Remote,
                 RemoteBody(body.id),
                 RemoteHands::default(),
-                view,
+                view_of(&body),
             ))
             .id();
         let playout = Playout::new(body.every.into());
         self.bodies.insert(body.id, WatchedBody { entity, body, playout });
     }
 
+    /// Takes the name, the color and the placement of a body that is there already.
+    fn looks(&mut self, world: &mut World, new: &CatalogBody) {
+        let Some(body) = self.bodies.get_mut(&new.id).filter(|body| body.body.goes_on_as(new)) else {
+            return;
+        };
+        let old = std::mem::replace(&mut body.body, new.clone());
+        let Ok(mut entity) = world.get_entity_mut(body.entity) else { return };
+        if old.name != new.name {
+            entity.insert(SharedBody::named(new.name.clone()));
+        }
+        if old.color != new.color {
+            entity.insert(view_of(new));
+        }
+        if old.placement != new.placement
+            && let Some(mut transform) = entity.get_mut::<Transform>()
+        {
+            let placed = transform_of(new.placement);
+            let moves = body.playout.newest().is_some_and(|state| state.pose.is_some());
+            // Frames with poses say where the body is.
+            *transform = if moves { Transform { scale: placed.scale, ..*transform } } else { placed };
+        }
+    }
+
     fn clear(&mut self, world: &mut World) {
+        self.hands = HandsPlayout::default();
         for (_, body) in std::mem::take(&mut self.bodies) {
             world.try_despawn(body.entity).ok();
         }
     }
 }
 
+fn view_of(body: &CatalogBody) -> WatchView {
+    let [r, g, b, a] = body.color.map(|part| f32::from(part) / 255.0);
+    WatchView { color: Srgba::new(r, g, b, a), hidden: false }
+}
+
 /// `PostUpdate`: writes what is displayed at this time.
 fn show(
     watched: ResMut<Watched>,
     state: Res<WatchState>,
-    mut bodies: Query<(&BodyState, &mut VisualState, &mut Transform)>,
+    mut bodies: Query<(&BodyState, &mut VisualState, &mut Transform, &mut RemoteHands)>,
 ) {
     let watched = watched.into_inner();
     let (Some(clock), Some(catalog)) = (&watched.clock, &state.catalog) else { return };
     let now = watched.began.elapsed();
-    for body in watched.bodies.values_mut() {
-        let Ok((state, mut visual, mut transform)) = bodies.get_mut(body.entity) else { continue };
-        let interval = Duration::from_secs_f64(f64::from(body.body.every) * catalog.step);
-        let Some(tick) = clock.tick(now, interval + MARGIN) else { continue };
+    let delayed =
+        |every: u16| clock.tick(now, Duration::from_secs_f64(f64::from(every) * catalog.step) + MARGIN);
+    let mut hands: BTreeMap<BodyId, Vec<RemoteHand>> = BTreeMap::new();
+    // Hands come as often as bodies, and are where they were at the body's time.
+    let shown = catalog.bodies.first().and_then(|body| delayed(body.every));
+    for hand in shown.map(|tick| watched.hands.at(tick)).unwrap_or_default() {
+        hands.entry(hand.body).or_default().push(remote_hand(&hand));
+    }
+    for (id, body) in &mut watched.bodies {
+        let Ok((state, mut visual, mut transform, mut shown)) = bodies.get_mut(body.entity) else { continue };
+        shown.set_if_neq(RemoteHands(hands.remove(id).unwrap_or_default()));
+        let Some(tick) = delayed(body.body.every) else { continue };
         let Some(pose) = body.playout.at(tick, &mut watched.scratch) else { continue };
         watched.scratch.resize(visual.q().len(), 0.0);
         if watched.scratch != visual.q()
@@ -256,5 +286,15 @@ fn show(
         if let Some(pose) = pose {
             set_pose(&mut transform, &pose, &pose, 1.0, state.scale());
         }
+    }
+}
+
+fn remote_hand(hand: &WatchHand) -> RemoteHand {
+    RemoteHand {
+        user: hand.key.user,
+        // Watchers do not receive where on the surface a hand is.
+        vertex: 0,
+        target: DVec3::from(hand.target),
+        reaction: DVec3::from(hand.reaction),
     }
 }

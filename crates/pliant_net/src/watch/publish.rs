@@ -1,27 +1,31 @@
-//! The host's side: what it publishes, and the thread that carries it to the relay.
+//! The host's side: what it publishes.
+
+mod carry;
+#[cfg(test)]
+mod tests;
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
 use bevy::prelude::*;
-use moq_net::{Timestamp, broadcast, group, origin, track};
 use pliant_modal::{ModalModel, ModelHash};
 use pliant_stream::watch::{
-    BodyEncoder, CATALOG_TRACK, Catalog, CatalogBody, CatalogCamera, HANDS_TRACK, MAX_MODEL, WatchConfig,
-    WatchHand, WatchHands, WatchNumbers, WatchSurface, body_track, model_track, pieces, surface_track,
+    BodyEncoder, Catalog, CatalogBody, CatalogCamera, MAX_MODEL, WatchConfig, WatchHand, WatchHands,
+    WatchNumbers, WatchSurface,
 };
-use pliant_stream::{BodyId, Placement, Tick, TickState};
-use tokio::sync::mpsc::{Receiver, Sender, channel};
+use pliant_stream::{BodyId, Placement, RigidState, Tick, TickState};
+use tokio::sync::mpsc::{Sender, channel};
 
-use super::relay::{Relay, RelayOptions, WatchError, without_token};
+use self::carry::carry;
+use super::relay::{RelayOptions, WatchError, without_token};
 
 /// Frames that wait for the thread of the relay. More are dropped and counted.
 const QUEUE: usize = 1024;
-/// How long a relay keeps a group beside the newest.
-const KEEP: Duration = Duration::from_secs(3);
+/// Least time between two catalogs that differ only in how bodies look and where they are, s.
+const LOOKS_EVERY: f64 = 0.1;
 /// How long the end of the session may take.
 const GOODBYE: Duration = Duration::from_millis(500);
 
@@ -92,12 +96,15 @@ impl Default for WatchView {
 }
 
 /// What has been published so far.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct PublishStats {
     /// Whether the relay is connected.
     pub connected: bool,
     /// How often it was connected.
     pub connections: u64,
+    /// Why the relay was not reached or was lost the last time. Empty if that was never so. A relay
+    /// that refuses a token is connected and lost at once, again and again.
+    pub relay_error: String,
     /// Frames handed to the thread of the relay.
     pub frames: u64,
     /// Bytes in these frames.
@@ -110,16 +117,24 @@ pub struct PublishStats {
 struct Shared {
     connected: AtomicBool,
     connections: AtomicU64,
+    relay_error: Mutex<String>,
 }
 
 /// For the thread of the relay.
 enum Item {
     Catalog(Tick, Vec<u8>),
-    Model(Arc<ModalModel>, usize),
+    /// A model, the number of its modes that watchers get, and whether they get its file.
+    Model(Arc<ModalModel>, usize, bool),
     Frame(BodyId, Tick, bool, Vec<u8>),
     Hands(Tick, Vec<u8>),
     /// A body is gone, and with it its model, if no other body has it.
     Gone(BodyId, Option<ModelHash>),
+}
+
+/// A removed body that the thread has no message about yet.
+struct Gone {
+    id: BodyId,
+    model: ModelHash,
 }
 
 struct PublishedBody {
@@ -129,6 +144,10 @@ struct PublishedBody {
     /// The thread was behind when the body was announced, so it is announced again.
     announced: bool,
     seen: bool,
+    /// Where an anchored body was at the last tick, and whether it has been moved since it was
+    /// announced. From then on its frames have poses.
+    placed: Placement,
+    moves: bool,
 }
 
 /// A body at a tick, as the host has it.
@@ -151,10 +170,21 @@ pub(crate) struct HostWatch {
     shared: Arc<Shared>,
     bodies: BTreeMap<BodyId, PublishedBody>,
     hands: Vec<WatchHand>,
-    /// Removed bodies that the thread has no message about yet.
-    gone: Vec<(BodyId, Option<ModelHash>)>,
-    catalog_sent: bool,
+    gone: Vec<Gone>,
+    catalog: CatalogNews,
+    /// When the last catalog was sent.
+    catalog_at: Tick,
     stats: PublishStats,
+}
+
+/// What the last catalog lacks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum CatalogNews {
+    Nothing,
+    /// Names, colors or placements. A catalog has all bodies in it, so these wait a moment.
+    Looks,
+    /// Bodies.
+    Bodies,
 }
 
 impl HostWatch {
@@ -181,6 +211,15 @@ impl HostWatch {
                 runtime.shutdown_timeout(GOODBYE);
             })
             .map_err(|error| WatchError::Setup(error.to_string()))?;
+        Self::with_queue(options, step, queue, shared)
+    }
+
+    fn with_queue(
+        options: PublishOptions,
+        step: f64,
+        queue: Sender<Item>,
+        shared: Arc<Shared>,
+    ) -> Result<Self, WatchError> {
         let mut random = [0; 8];
         let filled = ring::rand::SecureRandom::fill(&ring::rand::SystemRandom::new(), &mut random);
         filled.map_err(|_| WatchError::Setup("no random numbers".into()))?;
@@ -193,7 +232,8 @@ impl HostWatch {
             bodies: BTreeMap::new(),
             hands: Vec::new(),
             gone: Vec::new(),
-            catalog_sent: false,
+            catalog: CatalogNews::Bodies,
+            catalog_at: 0,
             stats: PublishStats::default(),
         })
     }
@@ -206,7 +246,8 @@ impl HostWatch {
         PublishStats {
             connected: self.shared.connected.load(Ordering::Relaxed),
             connections: self.shared.connections.load(Ordering::Relaxed),
-            ..self.stats
+            relay_error: self.shared.relay_error.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+            ..self.stats.clone()
         }
     }
 
@@ -233,9 +274,12 @@ impl HostWatch {
             warn_once!("the model of {} is too large for watchers", seen.name);
             return;
         }
-        let same = |body: &PublishedBody| Arc::ptr_eq(&body.model, seen.model);
-        let known = self.bodies.get(&seen.id).is_some_and(same);
-        if !known {
+        // Another model makes it another body, which comes after the end of the first.
+        let known = self.bodies.get(&seen.id).map(|body| Arc::ptr_eq(&body.model, seen.model));
+        if known == Some(false) || self.gone.iter().any(|gone| gone.id == seen.id) {
+            return;
+        }
+        if known.is_none() {
             let Ok(encoder) = BodyEncoder::new(seen.model, self.options.bodies, self.step) else { return };
             let entry = CatalogBody {
                 id: seen.id,
@@ -251,31 +295,48 @@ impl HostWatch {
                 color: [0; 4],
             };
             let model = seen.model.clone();
-            let (announced, seen_now) = (false, true);
-            self.bodies.insert(seen.id, PublishedBody { encoder, entry, model, announced, seen: seen_now });
+            let placed = seen.placement;
+            let (announced, seen_now, moves) = (false, true, false);
+            let new = PublishedBody { encoder, entry, model, announced, seen: seen_now, placed, moves };
+            self.bodies.insert(seen.id, new);
         }
         let Some(body) = self.bodies.get_mut(&seen.id) else { return };
         body.seen = true;
         let [r, g, b, a] = view.color.to_f32_array().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8);
-        // Frames of a free body have its pose, and where it began says nothing.
-        let placement = match body.entry.free {
-            true => Placement { scale: seen.placement.scale, ..Placement::default() },
-            false => seen.placement,
+        let at_rest = body.placed == seen.placement;
+        body.placed = seen.placement;
+        body.moves |= !body.entry.free && !at_rest;
+        // Frames of a free body have its pose, and where it began says nothing. Those of an anchored
+        // body do, too, once it is moved: a catalog is no way to send a movement.
+        let placement = match (body.entry.free, body.moves) {
+            (true, _) => Placement { scale: seen.placement.scale, ..Placement::default() },
+            (false, true) => Placement { scale: seen.placement.scale, ..body.entry.placement },
+            (false, false) => seen.placement,
         };
-        let entry = CatalogBody { warps: seen.warps, placement, color: [r, g, b, a], ..body.entry.clone() };
+        let (name, warps, color) = (seen.name.to_owned(), seen.warps, [r, g, b, a]);
+        let entry = CatalogBody { name, warps, placement, color, ..body.entry.clone() };
         if entry != body.entry {
+            let goes_on = body.entry.goes_on_as(&entry);
+            self.catalog = self.catalog.max(if goes_on { CatalogNews::Looks } else { CatalogNews::Bodies });
             body.entry = entry;
-            self.catalog_sent = false;
         }
+        let state = match body.moves {
+            true => TickState {
+                pose: Some(pose_of(&seen.placement)),
+                resting: seen.state.resting && at_rest,
+                ..*seen.state
+            },
+            false => *seen.state,
+        };
         if !body.announced {
-            let model = body.model.clone();
-            body.announced = self.queue.try_send(Item::Model(model, self.options.bodies.modes)).is_ok();
-            self.catalog_sent = false;
+            let item = Item::Model(body.model.clone(), self.options.bodies.modes, files);
+            body.announced = self.queue.try_send(item).is_ok();
+            self.catalog = CatalogNews::Bodies;
             if !body.announced {
                 return;
             }
         }
-        match body.encoder.encode(seen.state) {
+        match body.encoder.encode(&state) {
             Ok(Some(frame)) => {
                 let bytes = frame.bytes.len();
                 let item = Item::Frame(seen.id, seen.state.tick, frame.begins_group, frame.bytes);
@@ -303,20 +364,23 @@ impl HostWatch {
         let gone: Vec<BodyId> = self.bodies.iter().filter(|(_, b)| !b.seen).map(|(id, _)| *id).collect();
         for id in gone {
             let Some(body) = self.bodies.remove(&id) else { continue };
-            let model = body.entry.model;
-            let alone = self.bodies.values().all(|other| other.entry.model != model);
-            self.gone.push((id, alone.then_some(model)));
-            self.catalog_sent = false;
+            self.gone.push(Gone { id, model: body.entry.model });
+            self.catalog = CatalogNews::Bodies;
         }
-        // What the thread has no room for waits for the next tick.
-        while let Some((id, model)) = self.gone.pop() {
-            if self.queue.try_send(Item::Gone(id, model)).is_err() {
-                self.gone.push((id, model));
-                break;
-            }
-        }
+        // What the thread has no room for waits for the next tick. Meanwhile another body may have
+        // come that has the same model.
+        self.gone.retain(|gone| {
+            let alone = self.bodies.values().all(|other| other.entry.model != gone.model);
+            self.queue.try_send(Item::Gone(gone.id, alone.then_some(gone.model))).is_err()
+        });
         self.bodies.values_mut().for_each(|body| body.seen = false);
-        if !self.catalog_sent {
+        let pause = (LOOKS_EVERY / self.step) as Tick;
+        let due = match self.catalog {
+            CatalogNews::Nothing => false,
+            CatalogNews::Looks => tick.abs_diff(self.catalog_at) >= pause,
+            CatalogNews::Bodies => true,
+        };
+        if due {
             let catalog = Catalog {
                 session: self.session,
                 step: self.step,
@@ -326,7 +390,9 @@ impl HostWatch {
             };
             let bytes = catalog.encode();
             let length = bytes.len();
-            self.catalog_sent = self.send(Item::Catalog(tick, bytes), length);
+            if self.send(Item::Catalog(tick, bytes), length) {
+                (self.catalog, self.catalog_at) = (CatalogNews::Nothing, tick);
+            }
         }
         let hands = std::mem::take(&mut self.hands);
         if tick.is_multiple_of(self.options.bodies.every(self.step)) {
@@ -341,165 +407,12 @@ impl HostWatch {
     }
 }
 
-/// A track of frames in groups.
-struct Line {
-    track: track::Producer,
-    group: Option<group::Producer>,
-}
-
-impl Line {
-    fn new(broadcast: &broadcast::Producer, name: String) -> Result<Self, moq_net::Error> {
-        let info = track::Info::default().with_max_age(KEEP);
-        Ok(Self { track: broadcast.create_track(name, info)?, group: None })
+/// The pose of an anchored body at a placement, in meters of the body.
+fn pose_of(placement: &Placement) -> RigidState {
+    let scale = f64::from(placement.scale);
+    RigidState {
+        position: placement.position.map(|x| f64::from(x) / scale),
+        rotation: placement.orientation.map(f64::from),
+        ..RigidState::default()
     }
-
-    fn write(&mut self, begins: bool, time: Timestamp, bytes: Vec<u8>) -> Result<(), moq_net::Error> {
-        if begins {
-            if let Some(group) = self.group.take() {
-                group.finish()?;
-            }
-            self.group = Some(self.track.append_group()?);
-        }
-        match &mut self.group {
-            Some(group) => group.write_frame(time, bytes),
-            None => Ok(()),
-        }
-    }
-
-    fn finish(mut self) {
-        if let Some(group) = self.group.take() {
-            let _ = group.finish();
-        }
-        let _ = self.track.finish();
-    }
-}
-
-/// Carries what the host publishes to the relay, until the host drops its end of the queue.
-async fn carry(
-    relay: Relay,
-    name: String,
-    mut items: Receiver<Item>,
-    shared: Arc<Shared>,
-    step: f64,
-) -> Result<(), moq_net::Error> {
-    let (producer, driver) = origin::Producer::new(origin::Config::default());
-    tokio::task::spawn_local(moq_net::time::run(driver));
-    let broadcast = producer.create_broadcast(name.as_str())?;
-    let mut requests = broadcast.dynamic();
-    let mut catalog = Line::new(&broadcast, CATALOG_TRACK.into())?;
-    let mut hands = Line::new(&broadcast, HANDS_TRACK.into())?;
-    let mut bodies: BTreeMap<BodyId, Line> = BTreeMap::new();
-    let mut models: BTreeMap<ModelHash, (Arc<ModalModel>, usize)> = BTreeMap::new();
-    let client = moq_net::Client::new().with_publisher(&producer);
-    let stats = shared.clone();
-    let connection = tokio::task::spawn_local(async move {
-        relay
-            .keep(client, move |connected| {
-                stats.connected.store(connected, Ordering::Relaxed);
-                stats.connections.fetch_add(u64::from(connected), Ordering::Relaxed);
-            })
-            .await;
-    });
-    let mut announced = false;
-    let mut hand_frames = 0_u64;
-    loop {
-        let item = tokio::select! {
-            item = items.recv() => item,
-            request = requests.requested_track() => {
-                if let Ok(request) = request {
-                    serve(request, &models);
-                }
-                continue;
-            }
-        };
-        let Some(item) = item else { break };
-        match item {
-            Item::Catalog(tick, bytes) => {
-                catalog.write(true, time_of(tick, step), bytes)?;
-                if !announced {
-                    broadcast.announce(origin::Route::default())?;
-                    announced = true;
-                }
-            }
-            Item::Model(model, modes) => {
-                models.insert(model.hash(), (model, modes));
-            }
-            Item::Frame(body, tick, begins, bytes) => {
-                let line = match bodies.entry(body) {
-                    std::collections::btree_map::Entry::Occupied(line) => line.into_mut(),
-                    std::collections::btree_map::Entry::Vacant(place) => {
-                        place.insert(Line::new(&broadcast, body_track(body))?)
-                    }
-                };
-                line.write(begins, time_of(tick, step), bytes)?;
-            }
-            Item::Hands(tick, bytes) => {
-                // A watcher that comes late waits for nothing here: each frame stands alone.
-                let begins = hand_frames.is_multiple_of(32);
-                hand_frames += 1;
-                hands.write(begins, time_of(tick, step), bytes)?;
-            }
-            Item::Gone(body, model) => {
-                if let Some(model) = model {
-                    models.remove(&model);
-                }
-                if let Some(line) = bodies.remove(&body) {
-                    line.finish();
-                }
-            }
-        }
-    }
-    // The session is over: all watchers get its end, if the relay is there.
-    bodies.into_values().for_each(Line::finish);
-    hands.finish();
-    catalog.finish();
-    broadcast.close();
-    tokio::time::sleep(GOODBYE / 2).await;
-    connection.abort();
-    Ok(())
-}
-
-fn time_of(tick: Tick, step: f64) -> Timestamp {
-    // Below 2^53 milliseconds, which is within what a timestamp holds.
-    let millis = (tick as f64 * step * 1e3).clamp(0.0, 9e15) as u64;
-    Timestamp::from_millis(millis).unwrap_or(Timestamp::ZERO)
-}
-
-/// Answers a request for a model or a surface, which are made when somebody wants them.
-fn serve(request: track::Request, models: &BTreeMap<ModelHash, (Arc<ModalModel>, usize)>) {
-    let found = models.iter().find_map(|(hash, (model, modes))| {
-        let name = request.name();
-        let surface = name == surface_track(*hash);
-        (surface || name == model_track(*hash)).then(|| (model.clone(), *modes, surface))
-    });
-    let Some((model, modes, surface)) = found else {
-        request.reject(moq_net::Error::NotFound);
-        return;
-    };
-    tokio::task::spawn_local(async move {
-        let made = tokio::task::spawn_blocking(move || {
-            if surface { WatchSurface::new(&model, modes).encode() } else { model.to_bytes() }
-        });
-        let Ok(bytes) = made.await else {
-            request.reject(moq_net::Error::NotFound);
-            return;
-        };
-        let track = request.accept(track::Info::default());
-        let write = || -> Result<(), moq_net::Error> {
-            let mut group = track.append_group()?;
-            for piece in pieces(&bytes) {
-                group.write_frame(Timestamp::ZERO, piece.to_vec())?;
-            }
-            group.finish()
-        };
-        if let Err(error) = write() {
-            tracing::debug!("a model was not published: {error}");
-        }
-        // The track stays as long as somebody reads it, and is asked for again after that. It does
-        // not end before: the library of browsers drops a group that comes after the track's end,
-        // and the two are on streams of their own. Who asks reads a moment later.
-        tokio::time::sleep(KEEP).await;
-        let _ = track.unused().await;
-        let _ = track.finish();
-    });
 }

@@ -133,29 +133,50 @@ impl Relay {
         without_token(self.url.as_str())
     }
 
-    /// Keeps a client connected until `client` returns false, and calls `connected` at each change.
-    pub(super) async fn keep(&self, client: moq_net::Client, connected: impl Fn(bool)) {
+    /// Keeps a client connected, and calls `told` at each connection, and with the reason at each
+    /// loss and failure.
+    pub(super) async fn keep(&self, client: moq_net::Client, told: impl Fn(Result<(), String>)) {
         let mut pause = PAUSES[0];
+        // Each reason once, and at most two in a row that alternate.
+        let mut last = [String::new(), String::new()];
         loop {
-            match timeout(CONNECT, self.connect(&client)).await {
+            let why = match timeout(CONNECT, self.connect(&client)).await {
                 Ok(Ok((session, driver))) => {
-                    connected(true);
+                    told(Ok(()));
                     let since = Instant::now();
                     let end = moq_net::time::run(driver).await;
                     drop(session);
-                    connected(false);
                     // Relays refuse a token when the connection is already there.
                     if since.elapsed() > PAUSES[1] {
                         pause = PAUSES[0];
                     }
-                    tracing::debug!("the relay {} is lost: {end}", self.shown());
+                    format!("the relay {} is lost: {end}", self.shown())
                 }
-                Ok(Err(error)) => tracing::debug!("the relay {} is not reached: {error}", self.shown()),
-                Err(_) => tracing::debug!("the relay {} does not answer", self.shown()),
+                Ok(Err(error)) => format!("the relay {} is not reached: {error}", self.shown()),
+                Err(_) => format!("the relay {} does not answer", self.shown()),
+            };
+            let why = self.without_secrets(why);
+            if last.contains(&why) {
+                tracing::debug!("{why}");
+            } else {
+                tracing::warn!("{why}");
+                last.rotate_left(1);
+                last[1].clone_from(&why);
             }
+            told(Err(why));
             sleep(pause).await;
             pause = (pause * 2).min(PAUSES[1]);
         }
+    }
+
+    /// A text without the token of the relay's address, wherever it is from.
+    fn without_secrets(&self, mut text: String) -> String {
+        let whole = self.url.query().map(str::to_owned);
+        let values = self.url.query_pairs().map(|(_, value)| value.into_owned());
+        for secret in whole.into_iter().chain(values).filter(|secret| !secret.is_empty()) {
+            text = text.replace(&secret, "...");
+        }
+        text
     }
 
     async fn connect(

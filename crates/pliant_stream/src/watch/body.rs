@@ -85,7 +85,6 @@ pub struct BodyEncoder {
     reach: f64,
     every: u64,
     group_ticks: u64,
-    free: bool,
     /// Steps of the current group: meters, and parts of a quaternion.
     steps: (f32, f32),
     past: Vec<Past>,
@@ -120,7 +119,6 @@ impl BodyEncoder {
             reach: model.surface().positions().iter().map(far).fold(1e-6, f64::max),
             every: config.every(step),
             group_ticks: ((config.group / step).round() as u64).max(1),
-            free: model.is_free(),
             steps: (0.0, 0.0),
             past: Vec::new(),
             scratch: Vec::new(),
@@ -146,7 +144,8 @@ impl BodyEncoder {
     }
 
     /// The frame of a tick. `None` for a tick without a frame: between two frames, and while the
-    /// body sleeps.
+    /// body sleeps. A state with a pose gives a frame with a pose, also that of an anchored body
+    /// that is moved.
     ///
     /// # Errors
     /// [`StreamError::NotFinite`] for a state with a number that is not finite or beyond
@@ -160,7 +159,7 @@ impl BodyEncoder {
         if !state.tick.is_multiple_of(self.every) || (state.resting && self.sent_rest) {
             return Ok(None);
         }
-        let pose = if self.free { state.pose } else { None };
+        let pose = state.pose;
         let shown = &state.q[..state.q.len().min(self.places.len())];
         if !in_range(shown) || pose.is_some_and(|pose| !pose.is_valid()) || state.tick >= TICK_LIMIT {
             return Err(StreamError::NotFinite { what: "watched state" });
@@ -293,7 +292,8 @@ pub struct WatchedState {
     pub tick: Tick,
     /// Modal coordinates, kg^1/2 m. Those of the model's further modes are 0.
     pub q: Vec<f64>,
-    /// Pose of a free body. Its speeds are 0, since watchers get none.
+    /// Pose of a free body, and of an anchored one that is moved, in meters of the body. Its speeds
+    /// are 0, since watchers get none.
     pub pose: Option<RigidState>,
     /// The body sleeps: it stays as it is until the next frame.
     pub resting: bool,

@@ -34,11 +34,20 @@ pub struct CatalogBody {
     pub warps: bool,
     /// It has no anchors, so its frames have poses.
     pub free: bool,
-    /// Where an anchored body is. The poses of a free body say where it is; only the scale of its
-    /// placement counts.
+    /// Where an anchored body is. Where a body has poses in its frames they say where it is, and
+    /// only the scale of its placement counts.
     pub placement: Placement,
     /// Color: red, green, blue and opacity, sRGB, 0 to 255.
     pub color: [u8; 4],
+}
+
+impl CatalogBody {
+    /// Whether what a watcher has of this body serves for `other`, too. Then only the name, the
+    /// placement and the color differ, which it takes over; its frames go on.
+    pub fn goes_on_as(&self, other: &Self) -> bool {
+        let of_frames = |body: &Self| (body.id, body.model, body.modes, body.every, body.warps, body.free);
+        of_frames(self) == of_frames(other)
+    }
 }
 
 /// A place from which to look.

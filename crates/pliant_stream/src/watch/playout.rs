@@ -1,10 +1,10 @@
 //! Which state to draw at which time: a little behind the host, so that there is a next state. The
 //! page in `page/playout.ts` does the same.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use super::WatchedState;
+use super::{WatchHand, WatchHands, WatchedState};
 use crate::state::{RigidState, Tick};
 
 /// Most states of a body that wait to be drawn.
@@ -112,6 +112,55 @@ impl Playout {
     }
 }
 
+/// The hands that are drawn or wait. They are played out by their ticks, as bodies are: shown at
+/// their arrival they would be ahead of the body that they hold.
+#[derive(Debug, Clone, Default)]
+pub struct HandsPlayout {
+    frames: VecDeque<WatchHands>,
+}
+
+impl HandsPlayout {
+    /// Takes a frame. One that is older than the newest is left out, unless ticks are counted anew.
+    pub fn push(&mut self, frame: WatchHands) {
+        if let Some(last) = self.frames.back()
+            && frame.tick <= last.tick
+        {
+            if last.tick - frame.tick < OVERLAP {
+                return;
+            }
+            self.frames.clear();
+        }
+        self.frames.push_back(frame);
+        while self.frames.len() > MOST {
+            self.frames.pop_front();
+        }
+    }
+
+    /// The hands at a tick, in straight lines between two frames. A hand that only the earlier of
+    /// them has stays where it was until the later one.
+    pub fn at(&mut self, tick: f64) -> Vec<WatchHand> {
+        while self.frames.get(1).is_some_and(|next| next.tick as f64 <= tick) {
+            self.frames.pop_front();
+        }
+        let Some(from) = self.frames.front() else { return Vec::new() };
+        let to = self.frames.get(1).unwrap_or(from);
+        let span = (to.tick - from.tick) as f64;
+        let part = if span > 0.0 { ((tick - from.tick as f64) / span).clamp(0.0, 1.0) } else { 0.0 };
+        let mix = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] + (b[k] - a[k]) * part);
+        let of = |hand: &WatchHand| (hand.body, hand.key);
+        let next: BTreeMap<_, _> = to.hands.iter().map(|hand| (of(hand), hand)).collect();
+        let hands = from.hands.iter().map(|hand| match next.get(&of(hand)) {
+            Some(next) => WatchHand {
+                target: mix(hand.target, next.target),
+                reaction: mix(hand.reaction, next.reaction),
+                ..*hand
+            },
+            None => *hand,
+        });
+        hands.collect()
+    }
+}
+
 /// The pose `part` of the way from one to another. Frames are close, so that the straight line
 /// between two quaternions, scaled to unit length, is as good as the arc.
 fn between(from: &RigidState, to: &RigidState, part: f64) -> RigidState {
@@ -161,6 +210,35 @@ mod tests {
             }
         }
         assert!(worst < 1e-6, "the picture is off by {worst} ticks");
+    }
+
+    #[test]
+    fn hands_are_where_they_were_at_the_bodys_time() {
+        let hand = |grab, x: f64| WatchHand {
+            key: crate::GrabKey { grab, ..Default::default() },
+            target: [x, 0.0, 0.0],
+            reaction: [0.0, 2.0 * x, 0.0],
+            ..WatchHand::default()
+        };
+        let frame = |tick, hands| WatchHands { tick, hands, ..WatchHands::default() };
+        let mut playout = HandsPlayout::default();
+        assert_eq!(playout.at(0.0), []);
+        playout.push(frame(10, vec![hand(1, 1.0), hand(2, 5.0)]));
+        playout.push(frame(12, vec![hand(3, 9.0), hand(1, 2.0)]));
+        // One goes on, one ends with its frame, and one begins with its own.
+        assert_eq!(playout.at(9.0), [hand(1, 1.0), hand(2, 5.0)]);
+        assert_eq!(playout.at(11.0), [hand(1, 1.5), hand(2, 5.0)]);
+        assert_eq!(playout.at(12.0), [hand(3, 9.0), hand(1, 2.0)]);
+        assert_eq!(playout.at(1e9), [hand(3, 9.0), hand(1, 2.0)], "the newest stays");
+        playout.push(frame(11, Vec::new()));
+        assert_eq!(playout.at(12.0).len(), 2, "an old frame is left out");
+        for tick in 13..5000 {
+            playout.push(frame(tick, Vec::new()));
+        }
+        assert!(playout.frames.len() <= MOST);
+        // A host that has started again counts from the beginning.
+        playout.push(frame(7, vec![hand(1, 3.0)]));
+        assert_eq!(playout.at(7.0), [hand(1, 3.0)]);
     }
 
     #[test]

@@ -1,0 +1,326 @@
+//! What a host chooses for its watchers while they watch: where bodies are and how they look, what
+//! is hidden, and what a relay's lies may cost them.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+#[path = "support/relay.rs"]
+mod relay;
+mod support;
+#[path = "support/watching.rs"]
+mod watching;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use bevy::prelude::*;
+use moq_net::{Timestamp, origin};
+use pliant_body::{BodyState, ModalAsset, ModalBody, PliantTick};
+use pliant_modal::{ModalModel, ModelHash};
+use pliant_net::watch::{
+    PublishOptions, WatchCommands, WatchEvent, WatchNumbers, WatchPlugin, WatchState, WatchView, Watcher,
+};
+use pliant_net::{NetHost, NetPlugin, RemoteHands, SharedBody};
+use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, body_track, model_track, pieces};
+use pliant_stream::{BodyId, Placement, TickState};
+use relay::{Certificate, TestRelay};
+use support::{alone, app, bar, body_of, must, run_until, wait_for};
+use watching::{NAME, Publisher, Seen, options};
+
+/// A body that the host moves and paints in each frame stays the same entity for a watcher, goes
+/// the host's way evenly, and does not fill the catalog's track.
+#[test]
+fn a_body_that_is_moved_and_painted_stays_and_glides() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    let at = options(&relay);
+    let mut host = Publisher::start(PublishOptions::new(at.clone()));
+    let mut other = Watcher::open(&at, Vec::new()).unwrap();
+    let mut watching = app(NetPlugin::default());
+    watching.add_plugins(WatchPlugin);
+    watching.world_mut().commands().watch_session(at);
+    let first = wait_for("the body", || {
+        host.update();
+        watching.update();
+        body_of(&mut watching)
+    });
+    // The host's place by tick, along x.
+    let mut truth: BTreeMap<u64, f32> = BTreeMap::new();
+    let (mut seen, mut shown) = (Seen::default(), Vec::new());
+    for k in 0..400_u16 {
+        let x = 1e-3 * f32::from(k);
+        host.app.world_mut().get_mut::<Transform>(host.body).unwrap().translation.x = x;
+        let color = Srgba::rgb(f32::from(k % 250) / 250.0, 0.0, 0.0);
+        host.app.world_mut().entity_mut(host.body).insert(WatchView { color, hidden: false });
+        host.update();
+        truth.insert(host.app.world().resource::<PliantTick>().0, x);
+        watching.update();
+        seen.take(&mut other);
+        let there = body_of(&mut watching).expect("the body goes on");
+        assert_eq!(there, first, "the body is made anew when the host moves it");
+        shown.push(watching.world().get::<Transform>(there).unwrap().translation.x);
+    }
+    let color = watching.world().get::<WatchView>(first).unwrap().color;
+    let seconds = truth.len() as f64 / 40.0;
+    println!("{} catalogs in {seconds} s, red {}, at {:?}", seen.catalogs.len(), color.red, shown.last());
+    assert!(color.red > 0.0, "the color has not come");
+    assert!((seen.catalogs.len() as f64) < 14.0 * seconds + 3.0);
+    assert_eq!(seen.catalogs.iter().map(|catalog| catalog.bodies.len()).max(), Some(1));
+    // It goes on without jumps: never back, and never further at once than four ticks of the host.
+    let (low, high) = (*shown.first().unwrap(), *shown.last().unwrap());
+    assert!(low < 0.1 && high > 0.2, "from {low} to {high}");
+    let jump = shown.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f32::max);
+    let back = shown.windows(2).map(|pair| pair[0] - pair[1]).fold(0.0, f32::max);
+    let tick = truth.values().zip(truth.values().skip(1)).map(|(a, b)| b - a).fold(0.0, f32::max);
+    println!("largest jump {jump}, back {back}, the host's in a tick {tick}");
+    assert!(jump < 4.0 * tick.max(0.01) && back < 1e-3, "{jump} forward, {back} back, {tick} in a tick");
+    // It rests where the host leaves it.
+    run_until(&mut [&mut host.app, &mut watching], "the body at its last place", |apps| {
+        let there = body_of(apps[1]).unwrap();
+        let at = *apps[1].world().get::<Transform>(there).unwrap();
+        let end = *apps[0].world().get::<Transform>(host.body).unwrap();
+        at.translation.distance(end.translation) < 1e-3 && at.rotation.angle_between(end.rotation) < 1e-3
+    });
+}
+
+/// Hands, numbers and files are the host's to give, also to who asks for them by name, and a hidden
+/// body is gone until it is shown again.
+#[test]
+fn what_a_host_keeps_for_itself_is_not_sent() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    let at = options(&relay);
+    let mut publish = PublishOptions::new(at.clone());
+    (publish.hands, publish.numbers, publish.files) = (false, false, false);
+    let mut host = Publisher::start(publish);
+    let mut known = Watcher::open(&at, vec![bar()]).unwrap();
+    let mut seen = Seen::default();
+    wait_for("frames and numbers", || {
+        host.update();
+        seen.take(&mut known);
+        must!(seen.states.len() > 20 && seen.hands.len() > 20, "{:?}", seen.wrong);
+        Ok(())
+    });
+    assert!(seen.hands.iter().all(|hands| hands.hands.is_empty()));
+    assert!(seen.hands.iter().all(|hands| hands.numbers == WatchNumbers::default()));
+    let entry = seen.catalogs.last().unwrap().bodies[0].clone();
+    assert_eq!(entry.file_bytes, 0);
+    let hide = |host: &mut Publisher, hidden| {
+        let view = WatchView { hidden, ..WatchView::default() };
+        host.app.world_mut().entity_mut(host.body).insert(view);
+    };
+    hide(&mut host, true);
+    let (mut gone, mut again) = (false, 0);
+    wait_for("the body's end", || {
+        host.update();
+        while let Some(event) = known.poll() {
+            gone |= matches!(event, WatchEvent::Gone(id) if id == entry.id);
+        }
+        gone
+    });
+    hide(&mut host, false);
+    wait_for("the body again", || {
+        host.update();
+        while let Some(event) = known.poll() {
+            again += u32::from(matches!(event, WatchEvent::State(id, _) if id == entry.id));
+        }
+        again > 20
+    });
+}
+
+/// A relay that asks for the model's file by its name gets it only where the host gives it.
+#[test]
+fn a_file_that_the_host_keeps_is_not_given_to_who_knows_its_name() {
+    let _alone = alone();
+    for files in [true, false] {
+        let got = Arc::new(AtomicU64::new(0));
+        let count = got.clone();
+        let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
+            tokio::task::spawn_local(ask(origin.consume(), count));
+        });
+        let mut publish = PublishOptions::new(options(&relay));
+        publish.files = files;
+        let mut host = Publisher::start(publish);
+        for _ in 0..800 {
+            host.update();
+            if got.load(Ordering::Relaxed) > 0 {
+                break;
+            }
+        }
+        let got = got.load(Ordering::Relaxed);
+        println!("files {files}: {got} bytes");
+        assert_eq!(got > 0, files);
+    }
+}
+
+/// Asks for the file of the bar again and again, and counts its bytes.
+async fn ask(origin: origin::Consumer, count: Arc<AtomicU64>) {
+    loop {
+        let Ok(broadcast) = origin.routed_broadcast(NAME).await else { return };
+        let wanted = moq_net::track::Subscription::default();
+        if let Ok(track) = broadcast.track(&model_track(bar().hash()))
+            && let Ok(track) = track.subscribe(wanted).await
+        {
+            let mut track = track.ordered();
+            while let Ok(Some(mut group)) = track.next_group().await {
+                while let Ok(Some(frame)) = group.read_frame().await {
+                    count.fetch_add(frame.payload.len() as u64, Ordering::Relaxed);
+                }
+            }
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Who comes while the body sleeps sees it, and a second body beside it, by its own model.
+#[test]
+fn who_comes_late_sees_what_sleeps() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    let at = options(&relay);
+    let mut host = Publisher::start(PublishOptions::new(at.clone()));
+    let second = support::bar_of(8);
+    let handle = host.app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(second.clone()));
+    let new = (SharedBody::named("second"), Transform::default(), ModalBody::new(handle));
+    host.app.world_mut().spawn(new);
+    for _ in 0..20 {
+        host.update();
+    }
+    host.app.world_mut().despawn(host.hand);
+    let body = host.body;
+    wait_for("both sleep", || {
+        host.app.update();
+        std::thread::sleep(Duration::from_millis(3));
+        let mut states = host.app.world_mut().query::<&BodyState>();
+        states.iter(host.app.world()).count() == 2 && states.iter(host.app.world()).all(BodyState::is_resting)
+    });
+    for _ in 0..100 {
+        host.app.update();
+        std::thread::sleep(Duration::from_millis(3));
+    }
+    let mut late = Watcher::open(&at, Vec::new()).unwrap();
+    let mut seen = BTreeMap::new();
+    let mut models = BTreeMap::new();
+    wait_for("both bodies", || {
+        host.app.update();
+        std::thread::sleep(Duration::from_millis(3));
+        while let Some(event) = late.poll() {
+            match event {
+                WatchEvent::Body(body, model) => drop(models.insert(body.name, (body.id, model))),
+                WatchEvent::State(id, state) => drop(seen.insert(id, state)),
+                WatchEvent::Wrong(why) => panic!("{why}"),
+                _ => {}
+            }
+        }
+        must!(seen.len() == 2, "{} bodies have come, {} models", seen.len(), models.len());
+        Ok(())
+    });
+    assert_eq!((models["bar"].1.hash(), models["second"].1.hash()), (bar().hash(), second.hash()));
+    let state = &seen[&models["bar"].0];
+    let truth = host.app.world().get::<BodyState>(body).unwrap().body().q();
+    let off = watching::off(&bar(), &state.q, truth);
+    println!("a sleeping body is off by {off:.1e} of its size");
+    assert!(state.resting && off < 1e-3);
+}
+
+/// A relay that announces models without end, of which none comes, does not keep a true one out.
+#[test]
+fn models_that_never_come_leave_room_for_one_that_does() {
+    let _alone = alone();
+    let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
+        let broadcast = origin.publish(NAME, origin::Route::default()).unwrap();
+        tokio::task::spawn_local(false_models(broadcast, bar()));
+    });
+    let mut watcher = Watcher::open(&options(&relay), Vec::new()).unwrap();
+    let mut seen = Seen::default();
+    wait_for("the true body after a hundred false models", || {
+        std::thread::sleep(Duration::from_millis(3));
+        seen.take(&mut watcher);
+        must!(!seen.models.is_empty(), "{} catalogs, {:?}", seen.catalogs.len(), seen.wrong.last());
+        Ok(())
+    });
+    println!("{} catalogs before the true model", seen.catalogs.len());
+    assert!(seen.models.values().all(|model| model.hash() == bar().hash()));
+    assert!(seen.catalogs.len() > 20, "too few catalogs came to fill anything");
+}
+
+async fn false_models(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
+    let track = |name: &str| broadcast.create_track(name, None).unwrap();
+    let mut catalogs = track("catalog");
+    let (bytes, now) = (model.to_bytes(), Timestamp::now);
+    let files = track(&model_track(model.hash()));
+    let mut group = files.append_group().unwrap();
+    for piece in pieces(&bytes) {
+        group.write_frame(now(), piece.to_vec()).unwrap();
+    }
+    group.finish().unwrap();
+    let entry = CatalogBody {
+        id: BodyId(1),
+        name: "a bar".into(),
+        model: model.hash(),
+        file_bytes: bytes.len() as u64,
+        surface_bytes: 0,
+        modes: 4,
+        every: 1,
+        warps: true,
+        free: false,
+        placement: Placement::default(),
+        color: [0; 4],
+    };
+    let catalog = |body: CatalogBody| {
+        Catalog { session: 1, step: 0.025, name: "lies".into(), bodies: vec![body], cameras: Vec::new() }
+            .encode()
+    };
+    for k in 0..100_u8 {
+        // The track is there, and nothing ever comes in it.
+        let hash = ModelHash([k; 32]);
+        let empty = track(&model_track(hash));
+        // Small ones last, which fill what large ones leave.
+        let file_bytes = if k < 50 { 30 << 20 } else { 1 << 20 };
+        let body = CatalogBody { model: hash, file_bytes, ..entry.clone() };
+        catalogs.write_frame(now(), catalog(body)).unwrap();
+        tokio::time::sleep(Duration::from_millis(30)).await;
+        drop(empty);
+    }
+    catalogs.write_frame(now(), catalog(entry)).unwrap();
+    let mut encoder = BodyEncoder::new(&model, WatchConfig { rate: 40.0, ..WatchConfig::default() }, 0.025);
+    let encoder = encoder.as_mut().unwrap();
+    let mut body = track(&body_track(BodyId(1)));
+    for tick in 1.. {
+        let q = [0.01; 4];
+        let state = TickState { tick, q: &q, v: &[], a: &[], z: &[], pose: None, grabs: &[], resting: false };
+        if let Some(frame) = encoder.encode(&state).unwrap() {
+            body.write_frame(now(), frame.bytes).unwrap();
+        }
+        tokio::time::sleep(Duration::from_millis(25)).await;
+    }
+}
+
+/// The host's app and a watcher's learn why there is no relay, and the token is not in the reason.
+#[test]
+fn who_has_no_relay_knows_why() {
+    let _alone = alone();
+    let relay = TestRelay::start();
+    let mut at = options(&relay);
+    at.relay = format!("{}?jwt=SECRET0123", relay.address());
+    let port = relay.port;
+    drop(relay);
+    let mut host = Publisher::start(PublishOptions::new(at.clone()));
+    let mut watching = app(NetPlugin::default());
+    watching.add_plugins(WatchPlugin);
+    watching.world_mut().commands().watch_session(at);
+    let whys = wait_for("both reasons", || {
+        host.update();
+        watching.update();
+        let (_, stats) = host.app.world().resource::<NetHost>().published().unwrap();
+        let state = watching.world().resource::<WatchState>();
+        let whys = [stats.relay_error.clone(), state.relay_error.clone()];
+        whys.iter().all(|why| !why.is_empty()).then_some(whys)
+    });
+    println!("{whys:?}");
+    for why in whys {
+        assert!(why.contains(&port.to_string()) && !why.contains("SECRET"), "{why}");
+    }
+    let hands = watching.world_mut().query::<&RemoteHands>().iter(watching.world()).count();
+    assert_eq!(hands, 0);
+}
