@@ -12,11 +12,17 @@ use super::emulated::Emulation;
 use super::endpoint::TransportError;
 use super::identity::{AnyGuest, Identity, PinnedHost};
 use super::invite::Token;
+use pliant_stream::wire::PROTOCOL_VERSION;
 use pliant_stream::{DisconnectReason, Role};
 
-/// The application protocol and its version. The handshake negotiates it and refuses another
-/// version.
-pub const ALPN: &[u8] = b"pliant/7";
+/// The application protocol and [`PROTOCOL_VERSION`]. The handshake negotiates it and refuses
+/// another version.
+pub const ALPN: &[u8] = &{
+    assert!(PROTOCOL_VERSION < 10, "the version has one digit here");
+    let mut name = *b"pliant/0";
+    name[7] += PROTOCOL_VERSION as u8;
+    name
+};
 
 /// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

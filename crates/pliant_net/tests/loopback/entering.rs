@@ -9,6 +9,7 @@ use pliant_net::transport::{
     PeerId, Role, Token,
 };
 use pliant_stream::DisconnectReason;
+use pliant_stream::wire::PROTOCOL_VERSION;
 
 use crate::endpoints::{closed, connected, guest, host, is_first_heard_of, message, next};
 use crate::unauthenticated::UnauthenticatedPeer;
@@ -99,9 +100,30 @@ fn a_full_host_refuses_the_next_guest() {
 #[test]
 fn another_version_is_refused_in_the_handshake() {
     let host = host();
-    let error = UnauthenticatedPeer::new(b"pliant/0", true).connect(&host).unwrap_err();
-    assert!(error.to_string().contains("120"), "no_application_protocol is alert 120: {error}");
+    let before = format!("pliant/{}", PROTOCOL_VERSION - 1);
+    for other in ["pliant/0", &before] {
+        let error = UnauthenticatedPeer::new(other.as_bytes(), true).connect(&host).unwrap_err();
+        assert!(error.to_string().contains("120"), "no_application_protocol is alert 120: {error}");
+    }
     is_first_heard_of(&host);
+}
+
+/// The page that others read to speak the protocol has its version in three places.
+#[test]
+fn the_page_has_the_version() {
+    let page =
+        std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/protocol.md")).unwrap();
+    let alpn = String::from_utf8_lossy(ALPN);
+    assert_eq!(alpn, format!("pliant/{PROTOCOL_VERSION}"));
+    for text in [
+        format!("# The streaming protocol, version {PROTOCOL_VERSION}\n"),
+        format!("Hello carries is {PROTOCOL_VERSION}."),
+        format!("(ALPN `{alpn}`)"),
+        format!("| 0 | Hello | version u16 = {PROTOCOL_VERSION}; name"),
+        format!("| 0 | Hello | version u16 = {PROTOCOL_VERSION}; user"),
+    ] {
+        assert!(page.contains(&text), "docs/protocol.md lacks {text:?}");
+    }
 }
 
 #[test]
