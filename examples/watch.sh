@@ -4,7 +4,8 @@
 #
 #   examples/watch.sh [ARGUMENTS of dedicated_server ...]      such as --body bud.modal
 #
-# Needs moq-relay, which others have written, in PATH or named by PLIANT_MOQ_RELAY. It is installed by
+# Needs moq-relay, which others have written, in PATH or named by PLIANT_MOQ_RELAY. It is installed
+# by
 #
 #   cargo install moq-relay --version 0.17.10
 #

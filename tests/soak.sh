@@ -3,11 +3,11 @@
 #
 #   tests/soak.sh [--hours HOURS]
 #
-# Prints the memory, the open handles and the ticks a second of the server and of the guests' process
-# each tenth, and ends with 1 where memory or handles grow by more than a tenth after the first
-# tenth, where the ticks of the server drift by more than a thousandth from its clock, or where a
-# process ends with an error. Binaries: those of BIN, or built by cargo. Ends with 77 (skipped) where
-# a tool is missing.
+# Prints the memory, the open handles and the ticks a second of the server and of the guests'
+# process each tenth, and ends with 1 where memory or handles grow by more than a tenth after the
+# first tenth, where the ticks of the server drift by more than a thousandth from its clock, or
+# where a process ends with an error. Binaries: those of BIN, or built by cargo. Ends with 77
+# (skipped) where a tool is missing.
 set -u
 cd "$(dirname "$0")/.."
 skip() { echo "skipped: $1"; exit 77; }

@@ -23,9 +23,11 @@ SCENES = {
     "haptics": ("one body that is felt, a device at 1 kHz", ["window", "haptics"]),
     "everything": ("all features: host, device, recording, bakes", ["window", "net", "haptics", "rerun", "panel", "bake"]),
 }
-# They are compiled with the crates of another scene, whose number and size are not the engine's own.
+# They are compiled with the crates of another scene, whose number and size are not the engine's
+# own.
 ALONE = ["engine", "bare"]
-# Our own crates that ask something of the engine: with all of them chosen the engine's features are those of everything.
+# Our own crates that ask something of the engine: with all of them chosen the engine's features
+# are those of everything.
 OURS = ["pliant_rerun", "pliant_panel", "pliant_net", "pliant_haptics", "pliant_bake"]
 
 

@@ -87,7 +87,8 @@ def pliant(command, folder, cells, coordinates, elasticity):
     material = ["--material", "neo-hookean"] if elasticity == "reduced" else []
     run("bake", mesh, "--modes", coordinates, "--young", YOUNG, "--poisson", POISSON, "--density", DENSITY, "--anchor", "x<1e-9",
         *material, "--no-cache", "-o", model)
-    # The hand holds the wall's side of the bar, where nothing moves: a step of this costs what one with a hand costs.
+    # The hand holds the wall's side of the bar, where nothing moves: a step of this costs what one
+    # with a hand costs.
     told = json.loads(run("pull", model, "--at", f"0,{SIDE / 2},{SIDE / 2}", "--radius", 0.02, "--by", "0,0,0", "--gravity", f"0,{-GRAVITY},0",
                           "--elasticity", elasticity, "--surface", surface, "--json"))
     if not told["at_rest"]:

@@ -149,7 +149,8 @@ def bullet(folder, values, vectors, nodal_mass):
         raise RuntimeError("PyBullet did not take the file")
     where = lambda: float(np.mean([p[2] for p in pybullet.getMeshData(body, -1)[1]]))
     start, steps, warm = where(), 220, 20
-    # A step alone: its vertices come to Python as tuples, which is the binding's cost and not the solver's.
+    # A step alone: its vertices come to Python as tuples, which is the binding's cost and not the
+    # solver's.
     times = median_us(pybullet.stepSimulation, steps, warm)
     drop = start - where()
 
@@ -194,7 +195,8 @@ def exudyn_floating_frame(folder, values, vectors):
     body.nodes, body.elements = {"Position": points}, [{"Name": "bar", "Tet4": tets}]
     body.massMatrix, body.stiffnessMatrix = (mmread(folder / f"{name}.mtx").tocsr() for name in "MK")
     body.modeBasis, body.eigenValues = {"matrix": vectors, "type": "NormalModes"}, values
-    # The four nodes about the axis of the end: the bar is pulled straight, so where it goes is known.
+    # The four nodes about the axis of the end: the bar is pulled straight, so where it goes is
+    # known.
     inner = sorted(range(len(points)), key=lambda i: (-points[i][0], np.hypot(points[i][1] - SIZE[1] / 2, points[i][2] - SIZE[2] / 2)))[:4]
     force, mass, step = 20.0, DENSITY * np.prod(SIZE), 1 / 240
 
@@ -221,7 +223,8 @@ def exudyn_floating_frame(folder, values, vectors):
             raise RuntimeError(f"Exudyn's bar went {went} m, and Newton says {want} m")
         return seconds
 
-    # The difference of a long and a short run: what the solver does before its first step is in neither.
+    # The difference of a long and a short run: what the solver does before its first step is in
+    # neither.
     simulate(60)
     return float(np.median([(simulate(660) - simulate(60)) / 600 for _ in range(7)])) * 1e6
 

@@ -6,10 +6,10 @@
 #
 #   tests/load/run.sh BODY.modal [SECONDS of the largest [USERS...]]
 #
-# LIGHT=1: no bars on times, for an unoptimized build or a busy machine: only nothing may be missing.
-# SENT=1: the bots have no model, so that it is sent to all of them at once. AS="chrt --rr 10" or
-# another prefix for the server's command, so that the bots' threads and whatever else runs here do
-# not take its processor from it. Binaries: those of BIN, or built by cargo.
+# LIGHT=1: no bars on times, for an unoptimized build or a busy machine: only nothing may be
+# missing. SENT=1: the bots have no model, so that it is sent to all of them at once. AS="chrt --rr
+# 10" or another prefix for the server's command, so that the bots' threads and whatever else runs
+# here do not take its processor from it. Binaries: those of BIN, or built by cargo.
 #
 # Its figures are times. Where something else keeps the machine busy it says so and ends with 77
 # (skipped); BUSY=1 measures all the same.

@@ -19,7 +19,7 @@ seconds=${2:-20}
 [ $# -ge 2 ] && shift 2 || shift $#
 watchers=${*:-1 10 100}
 cd "$(dirname "$0")/../.."
-build dedicated_server watch_crowd
+build dedicated_server watch_load
 # Each watcher has a socket of its own.
 ulimit -n "$(ulimit -Hn)"
 work=$(mktemp -d)
@@ -52,7 +52,7 @@ for n in $watchers; do
         measured="$measured second=$!"
         at="$at,https://127.0.0.1:$((first + 1))/"
     fi
-    # The host's ticks are among what is measured, so it goes before the crowd.
+    # The host's ticks are among what is measured, so it goes before the watchers.
     ${AS:-} "$BIN/examples/dedicated_server" --bind 127.0.0.1:0 --hz 60 --play --body "$body" \
         --publish "https://127.0.0.1:$first/" --certificate "$hash" --session load \
         --watch-rate "${RATE:-30}" >"$work/host.log" 2>&1 &
@@ -60,7 +60,7 @@ for n in $watchers; do
     measured="$measured host=$!"
     sleep 3
     # shellcheck disable=SC2086
-    "$BIN/examples/watch_crowd" "$at" "$hash" load "$body" "$n" "$seconds" $measured || {
+    "$BIN/examples/watch_load" "$at" "$hash" load "$body" "$n" "$seconds" $measured || {
         tail -3 "$work/relay.log" "$work/host.log" >&2
         exit 1
     }

@@ -15,7 +15,7 @@ moq=${PLIANT_MOQ:-$(command -v moq)}
 [ -x "$moq" ] || skip "no moq (cargo install moq-cli --version 0.14.10)"
 body=$(realpath "${1:?which body}")
 cd "$(dirname "$0")/../.."
-build dedicated_server watch_crowd
+build dedicated_server watch_load
 work=$(mktemp -d)
 pids=""
 trap 'for pid in $pids; do kill "$pid" 2>/dev/null; done; wait; rm -rf "$work"' EXIT
@@ -86,12 +86,12 @@ grep -q "eyJ" "$work/host-heart.log" && fail "a token is in the link for watcher
 
 # Whether one watcher at a relay sees a session within ten seconds.
 sees() { # relay with a token, session
-    timeout 10 "$BIN/examples/watch_crowd" "$1" system "$2" "$body" 1 2 \
+    timeout 10 "$BIN/examples/watch_load" "$1" system "$2" "$body" 1 2 \
         >"$work/seen" 2>"$work/seen.log"
     case $? in
     0) grep -q '"with_picture":1' "$work/seen" ;;
     124) false ;;
-    *) fail "watch_crowd" ;;
+    *) fail "watch_load" ;;
     esac
 }
 sees "$b?jwt=$watcher" lectures/heart || fail "a token shows nothing at the second relay"

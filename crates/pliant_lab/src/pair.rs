@@ -137,7 +137,13 @@ impl Direction {
     }
 
     /// What the network's threads do: sends what has waited, and receives for the app `to`.
-    fn pass(&mut self, datagrams: &mut EmulatedLink, [from, to]: [Stalled; 2], parted: bool, now: Duration) {
+    fn pass(
+        &mut self,
+        datagrams: &mut EmulatedLink,
+        [from, to]: [Stalled; 2],
+        partitioned: bool,
+        now: Duration,
+    ) {
         while let Some(packet) = (!from.network).then(|| self.sent.pop()).flatten() {
             self.send(datagrams, from, now, packet);
         }
@@ -146,11 +152,11 @@ impl Direction {
         }
         // An app that runs reads at once.
         let most = if to.app { WAITING } else { usize::MAX };
-        while let Some(bytes) = (!parted).then(|| self.reliable.poll(now)).flatten() {
+        while let Some(bytes) = (!partitioned).then(|| self.reliable.poll(now)).flatten() {
             self.received.push(Channel::Message, bytes, most);
         }
         while let Some(bytes) = datagrams.poll(now) {
-            if !parted {
+            if !partitioned {
                 self.received.push(Channel::Datagram, bytes, most);
             }
         }
@@ -190,7 +196,7 @@ pub struct GuestEnd {
     /// What this guest has sent before it was cut off still arrives.
     lingers: bool,
     stalled: Stalled,
-    parted: bool,
+    partitioned: bool,
     /// The host that this guest was connected to is gone.
     lost: bool,
     /// The guest's clock minus the virtual time.
@@ -293,9 +299,9 @@ impl Pair {
 
     /// Parts a guest from the host, or joins them again. Datagrams are lost meanwhile, and messages
     /// wait, since a transport sends them again.
-    pub fn part(&mut self, guest: usize, parted: bool) {
+    pub fn part(&mut self, guest: usize, partitioned: bool) {
         if let Some(g) = self.guests.get_mut(guest) {
-            g.parted = parted;
+            g.partitioned = partitioned;
         }
     }
 
@@ -360,7 +366,7 @@ impl Pair {
             connected: true,
             lingers: false,
             stalled: Stalled::default(),
-            parted: false,
+            partitioned: false,
             lost: false,
             ahead: Duration::ZERO,
         });
@@ -411,9 +417,9 @@ impl Pair {
             // What arrives at a network that stalls waits, and messages wait for the network.
             for (link, stalled) in [
                 (&g.down, g.stalled.network),
-                (&g.to_guest.reliable, g.stalled.network || g.parted),
+                (&g.to_guest.reliable, g.stalled.network || g.partitioned),
                 (&g.up, self.stalled.network),
-                (&g.to_host.reliable, self.stalled.network || g.parted),
+                (&g.to_host.reliable, self.stalled.network || g.partitioned),
             ] {
                 take(link.next_wakeup().filter(|_| !stalled));
             }
@@ -434,8 +440,8 @@ impl Pair {
         let host_now = now + self.ahead;
         for (index, g) in self.guests.iter_mut().enumerate() {
             let peer = PeerId(index as u64 + 1);
-            g.to_host.pass(&mut g.up, [g.stalled, self.stalled], g.parted, now);
-            g.to_guest.pass(&mut g.down, [self.stalled, g.stalled], g.parted, now);
+            g.to_host.pass(&mut g.up, [g.stalled, self.stalled], g.partitioned, now);
+            g.to_guest.pass(&mut g.down, [self.stalled, g.stalled], g.partitioned, now);
             // Messages come first, so that a snapshot is handled before a frame of the same arrival
             // time.
             while let Some((channel, bytes)) = (!self.stalled.app).then(|| g.to_host.received.pop()).flatten()

@@ -474,7 +474,7 @@ fn push(
         let Ok((mut velocity, mut spin, mut increments)) = velocities.get_mut(entity) else { continue };
         // A share at once and the rest in the substeps go as far as the solver took it to go. What
         // holds a body up does so at every moment, so gravity is shared out in the same way.
-        // Avian's contacts hold a force in the substeps better than a blow.
+        // Avian's contacts hold a force in the substeps better than an impulse.
         let by_parts = rigid.is_held || spread >= 1.0 || sleeps;
         let once = if by_parts { 0.0 } else { (rigid.weight - spread) / (1.0 - spread) };
         if once != 0.0 {

@@ -11,8 +11,8 @@ use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::peer::{PeerSession, PeerSessionConfig};
 use pliant_stream::{BodyId, Channel, PeerId, StepSettings, UserId};
 
+use super::attack::Attacker;
 use super::device::{DeviceLoop, DeviceRecord};
-use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::{Processes, network};
 use super::{
@@ -78,7 +78,7 @@ struct Mesh {
     nodes: Vec<Node>,
     wires: Vec<Wire>,
     processes: Processes,
-    mischief: Mischief,
+    attacker: Attacker,
     path: LinkConfig,
     random: Random,
     now: Duration,
@@ -111,7 +111,7 @@ pub(super) fn run(
         nodes: Vec::new(),
         wires: Vec::new(),
         processes: Processes::default(),
-        mischief: Mischief::default(),
+        attacker: Attacker::default(),
         path,
         random: Random::new(!seed ^ random.next()),
         now: Duration::ZERO,
@@ -146,8 +146,8 @@ pub(super) fn run(
             mesh.begin(*fault);
         }
         if mesh.now >= HEALED {
-            // Who was sent away by some and not by others makes them differ for as long as it is
-            // there.
+            // The malicious peer leaves at the end: where only some have kicked it, they differ from
+            // the others for as long as it is in the session.
             mesh.nodes[count - 1].session = None;
         }
         let present = if mesh.now < HEALED { count } else { count - 1 };

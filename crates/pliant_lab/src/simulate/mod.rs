@@ -1,4 +1,4 @@
-//! Whole sessions under faults, in virtual time: who crashes, stalls, is parted or lies, and when,
+//! Whole sessions under faults, in virtual time: who crashes, stalls, is partitioned or lies, and when,
 //! follows from a seed, and so does all else.
 //!
 //! The even seeds are a host with guests, the odd ones a mesh of peers. The last of them is
@@ -10,9 +10,9 @@
 //! bounded queue no frame waits for. An app writes the numbers of users and the models that came:
 //! these are what a slow disk delays here.
 
+mod attack;
 mod device;
 mod mesh;
-mod mischief;
 mod schedule;
 mod star;
 mod state;

@@ -13,8 +13,8 @@ use pliant_stream::{
     UserId,
 };
 
+use super::attack::Attacker;
 use super::device::{DeviceLoop, DeviceRecord};
-use super::mischief::Mischief;
 use super::schedule::Random;
 use super::state::Processes;
 use super::{
@@ -62,7 +62,7 @@ struct Apps {
     device_record: DeviceRecord,
     /// The processes whose apps have just written a file.
     wrote: Vec<usize>,
-    mischief: Mischief,
+    attacker: Attacker,
     random: Random,
     ticks: u64,
     digest: Digest,
@@ -249,7 +249,7 @@ impl World for Apps {
 
     fn guest_sent(&mut self, guest: usize, channel: Channel, bytes: &[u8]) {
         if self.guests[guest].0 == self.malicious() {
-            self.mischief.keep(&mut self.random, channel, bytes);
+            self.attacker.keep(&mut self.random, channel, bytes);
         }
     }
 }
@@ -307,7 +307,7 @@ pub(super) fn run(
         devices: std::iter::repeat_with(|| None).take(count).collect(),
         device_record: DeviceRecord::default(),
         wrote: Vec::new(),
-        mischief: Mischief::default(),
+        attacker: Attacker::default(),
         random: Random::new(!seed),
         ticks: 0,
         digest: Digest::EMPTY,
@@ -413,10 +413,11 @@ impl Star {
         for process in 1..self.guest.len() {
             let stalled = self.processes.stalled(process, now);
             self.device(process, now)?;
-            let parted = self.processes.is_parted(process, now) || self.processes.is_parted(0, now);
+            let partitioned =
+                self.processes.is_partitioned(process, now) || self.processes.is_partitioned(0, now);
             if let Some(guest) = self.guest[process] {
                 self.pair.stall_guest(guest, stalled);
-                self.pair.part(guest, parted);
+                self.pair.part(guest, partitioned);
                 if self.pair.guests[guest].session.user().is_some() {
                     self.processes.take(process, &[FaultKind::Partition, FaultKind::BadNetwork], now);
                     self.processes.take(0, &[FaultKind::Partition, FaultKind::BadNetwork], now);
@@ -433,13 +434,13 @@ impl Star {
                 if end.session.is_closed() && self.again[process].is_none() {
                     let pause = Duration::from_millis(self.random.range(200, 600));
                     // Who was sent away for breaking the protocol stays away.
-                    let stays_away = process == malicious && self.apps.mischief.now.is_some();
+                    let stays_away = process == malicious && self.apps.attacker.now.is_some();
                     self.again[process] = Some(if stays_away { END } else { now + pause });
                 }
             }
             let due = self.again[process].is_some_and(|again| again <= now);
             let runs = host == Stalled::default() && stalled == host;
-            if due && runs && !parted && !self.processes.is_down(process, now) {
+            if due && runs && !partitioned && !self.processes.is_down(process, now) {
                 self.connect(process)?;
             }
         }
@@ -493,21 +494,21 @@ impl Star {
     }
 
     fn attack(&mut self, now: Duration, malicious: usize) {
-        let before = std::mem::replace(&mut self.apps.mischief.now, self.processes.attack(now));
+        let before = std::mem::replace(&mut self.apps.attacker.now, self.processes.attack(now));
         let Some(guest) = self.guest[malicious] else { return };
-        if before == Some(FaultKind::Flood) && self.apps.mischief.now.is_none() {
+        if before == Some(FaultKind::Flood) && self.apps.attacker.now.is_none() {
             for grab in FLOOD_GRABS {
                 self.pair.send_as(guest, Channel::Message, GuestMessage::GrabEnd { grab }.encode());
             }
         }
-        let packets = self.apps.mischief.packets(&mut self.random);
-        if let Some(kind) = self.apps.mischief.now.filter(|_| !packets.is_empty()) {
+        let packets = self.apps.attacker.packets(&mut self.random);
+        if let Some(kind) = self.apps.attacker.now.filter(|_| !packets.is_empty()) {
             self.processes.take(malicious, &[kind], now);
         }
         for (channel, bytes) in packets {
             self.pair.send_as(guest, channel, bytes);
         }
-        if self.apps.mischief.now == Some(FaultKind::Flood) {
+        if self.apps.attacker.now == Some(FaultKind::Flood) {
             let grab = FLOOD_GRABS.start + self.random.range(0, FLOOD_GRABS.len() as u64) as u16;
             let message = match self.random.range(0, 2) {
                 0 => GuestMessage::GrabEnd { grab },

@@ -103,7 +103,7 @@ impl Processes {
         [stalled, self.is(process, DeviceLost, now)]
     }
 
-    pub(super) fn is_parted(&self, process: usize, now: Duration) -> bool {
+    pub(super) fn is_partitioned(&self, process: usize, now: Duration) -> bool {
         self.is(process, FaultKind::Partition, now)
     }
 

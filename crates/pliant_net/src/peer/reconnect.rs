@@ -39,8 +39,8 @@ impl NetPeer {
         let keys: BTreeSet<Fingerprint> = here.map(|(_, other)| other.key).collect();
         for (number, address) in others {
             let Ok(invite) = address.parse::<Invite>() else { continue };
-            // A connection to the address of a liar says nothing: who is in the session is known.
-            // Nor is one who is there called as somebody else.
+            // A malicious peer may send any address. So a peer that is in the session is not called
+            // at one, neither under its own number nor under another.
             let is_here = self.users.get(number).is_some() || keys.contains(&invite.fingerprint);
             if number < own && number != UserId::HOST && !is_here && !self.refused.contains(&number) {
                 self.missed.report(now, reporter, number, invite);

@@ -258,8 +258,9 @@ impl CarrierPort {
         carrier
     }
 
-    /// Tells that another end is there. `remote` is the netcode's number of it, which other methods
-    /// have again. Of one that is there already, the path is taken over for later connections.
+    /// Reports that the netcode has another end. `remote` is the netcode's number of it, which the
+    /// other methods take. For a remote that is known already, the path replaces the one for later
+    /// connections.
     pub fn connected(&self, remote: u64, path: RemotePath) {
         let mut state = self.state();
         let remote = state.remotes.entry(remote).or_insert_with(|| Remote {

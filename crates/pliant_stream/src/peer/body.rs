@@ -53,10 +53,10 @@ pub struct PeerBody {
     used: Ring<BodyInputs>,
     visual: VisualCopy,
     grabs: Vec<GrabState>,
-    /// Ticks that are gone through again, and the first one that the next pass begins with.
+    /// Ticks that are stepped again, and the first one that the next pass begins with.
     pass: Option<Pass>,
     late: Option<Tick>,
-    /// Memory for the inputs of a tick that is gone through again.
+    /// Memory for the inputs of a tick that is stepped again.
     again: BodyInputs,
     restepped: u64,
     pub(crate) columns: Columns,
@@ -369,7 +369,7 @@ impl PeerBody {
         true
     }
 
-    /// Steps to the next tick, and goes on with what is gone through again, so that it comes no
+    /// Steps to the next tick, and goes on with what is stepped again, so that it comes no
     /// farther behind.
     pub(crate) fn advance(&mut self, inputs: &InputLog) {
         self.go_on(inputs);

@@ -161,10 +161,10 @@ impl RemotePeer {
         &mut self,
         all: &mut SharedBudgets,
         now: Duration,
-        [own, crowd]: [f64; 2],
+        [own, of_all]: [f64; 2],
     ) -> bool {
         self.budgets.late.spend(now, own)
-            && (self.share.late.spend(now, own) || all.late.spend_or_owe(now, own + crowd))
+            && (self.share.late.spend(now, own) || all.late.spend_or_owe(now, own + of_all))
     }
 
     /// Pays for a new patch, and returns whether the budgets allow it.

@@ -77,7 +77,7 @@ pub struct PeerSession {
     /// Ticks that this peer has lately caught up to the others. If they turn out to be behind, it
     /// waits as many.
     caught_up: u64,
-    /// The body that goes through past ticks first.
+    /// The body that steps past ticks again first.
     turn: BodyId,
     /// The tick of the last state taken. Rollback never goes to an earlier tick.
     taken: Tick,
@@ -251,7 +251,7 @@ impl PeerSession {
 
     /// The newest tick for which all inputs are known and have acted. Its state is final.
     pub fn confirmed(&self) -> Tick {
-        self.inputs.complete().min(self.settled())
+        self.inputs.complete().min(self.resimulated_to())
     }
 
     /// The state of a body after one of the last 128 ticks.
@@ -303,7 +303,7 @@ impl PeerSession {
                     }
                     let bodies = self.changed_by(user, &input);
                     let waits = |id: &BodyId| !self.bodies.get(id).is_some_and(|b| b.cannot_wait(tick));
-                    let again = self.ticks_again(&bodies, tick);
+                    let again = self.ticks_to_resimulate(&bodies, tick);
                     let Some(other) = self.others.get_mut(&peer) else { return };
                     let pays = (other, &mut self.shared);
                     if bodies.iter().all(waits)
@@ -395,7 +395,7 @@ impl PeerSession {
         }
         self.send_introductions(now);
         self.roll_back();
-        self.go_through();
+        self.resimulate();
         let mut stepped = 0;
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
         let mut due = due;
@@ -410,8 +410,8 @@ impl PeerSession {
             self.caught_up = self.caught_up.saturating_sub(1);
             due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
             if stepped == STEPS && due <= now {
-                // The clock does not tell a stall from a jump of its own. What the others tell of
-                // says how many ticks were missed.
+                // A stall of this machine and a jump of its clock look the same here. The ticks that
+                // the other peers report decide how many were missed.
                 let missed = ((now - due).as_secs_f64() / self.config.step) as u64;
                 self.missed = self.missed.saturating_add(missed).min(MAX_MISSED);
                 due = now + Duration::from_secs_f64(self.config.step);

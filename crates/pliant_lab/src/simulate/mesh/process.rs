@@ -41,8 +41,8 @@ impl Mesh {
         Ok(())
     }
 
-    fn is_parted(&self, a: usize, b: usize) -> bool {
-        self.processes.is_parted(a, self.now) || self.processes.is_parted(b, self.now)
+    fn is_partitioned(&self, a: usize, b: usize) -> bool {
+        self.processes.is_partitioned(a, self.now) || self.processes.is_partitioned(b, self.now)
     }
 
     /// Runs the loop of the process's device, which ends and begins with it.
@@ -76,14 +76,14 @@ impl Mesh {
                 if self.wires[index].sides[at].closed {
                     continue;
                 }
-                let parted = self.is_parted(process, self.wires[index].sides[1 - at].process);
+                let partitioned = self.is_partitioned(process, self.wires[index].sides[1 - at].process);
                 let [a, b] = &mut self.wires[index].sides;
                 let (side, other) = if at == 0 { (a, b) } else { (b, a) };
-                while let Some(packet) = (!parted).then(|| other.links[1].poll(self.now)).flatten() {
+                while let Some(packet) = (!partitioned).then(|| other.links[1].poll(self.now)).flatten() {
                     side.received.push(Channel::Message, packet, most);
                 }
                 while let Some(packet) = other.links[0].poll(self.now) {
-                    if !parted {
+                    if !partitioned {
                         side.received.push(Channel::Datagram, packet, most);
                     }
                 }
@@ -234,14 +234,14 @@ impl Mesh {
 
     pub(super) fn send(&mut self, process: usize) {
         let malicious = process == self.malicious();
-        self.mischief.now = self.processes.attack(self.now);
+        self.attacker.now = self.processes.attack(self.now);
         let mut out: Vec<(usize, Packet)> = Vec::new();
         let node = &mut self.nodes[process];
         let Some(session) = &mut node.session else { return };
         while let Some(Output { peer, channel, bytes }) = session.poll_output() {
             let index = usize::try_from(peer.0).unwrap_or(usize::MAX);
             if malicious {
-                self.mischief.keep(&mut self.random, channel, &bytes);
+                self.attacker.keep(&mut self.random, channel, &bytes);
             }
             out.push((index, packet(channel, bytes.to_vec())));
         }
@@ -250,8 +250,8 @@ impl Mesh {
                 if side.open && side.life == node.life && session.stats(PeerId(index as u64)).is_none() {
                     out.push((index, Packet::Close));
                 } else if malicious && side.open {
-                    let lies = self.mischief.packets(&mut self.random);
-                    if let Some(kind) = self.mischief.now.filter(|_| !lies.is_empty()) {
+                    let lies = self.attacker.packets(&mut self.random);
+                    if let Some(kind) = self.attacker.now.filter(|_| !lies.is_empty()) {
                         self.processes.take(process, &[kind], self.now);
                     }
                     out.extend(lies.into_iter().map(|(channel, bytes)| (index, packet(channel, bytes))));

@@ -430,7 +430,7 @@ impl<P: Member> Group<'_, P> {
             all += point.world_force();
         }
         let model = &self.view(0).kernel.model;
-        // What does not hold each other is a blow.
+        // Forces that are not opposite to each other push the body and do not press it.
         self.h * self.h * (sum - all.norm()) > PRESSED * model.mass() * model.size()
     }
 

@@ -44,7 +44,8 @@ impl PortState {
             self.remotes.iter().find(|(_, remote)| remote.path.key == key).map(|(&remote, _)| remote);
         let is_open = |remote: &Remote| remote.has_open(connections);
         match remote {
-            // Of who is there, or is being called, somebody else may tell again, and falsely.
+            // A remote with an open connection is not called again: a third party may have sent its
+            // address, and a wrong one.
             Some(remote) if self.remotes.get(&remote).is_some_and(is_open) => {
                 connections.ended(id, DisconnectReason::Full);
             }

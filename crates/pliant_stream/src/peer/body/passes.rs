@@ -1,4 +1,4 @@
-//! What late inputs change. The ticks since then are gone through again, a few in each update,
+//! What late inputs change. The ticks since then are stepped again, a few in each update,
 //! while the body goes on as it is.
 
 use nalgebra::{UnitQuaternion, Vector3};
@@ -30,8 +30,8 @@ pub(super) struct Pass {
 
 impl PeerBody {
     /// The newest tick whose state has all inputs that are known. The ones after it are, or will
-    /// be, gone through again.
-    pub(crate) fn settled(&self) -> Tick {
+    /// be, stepped again.
+    pub(crate) fn resimulated_to(&self) -> Tick {
         let done = self.pass.as_ref().map_or(self.tick(), |pass| pass.tick);
         self.late.map_or(done, |late| done.min(late.saturating_sub(1)))
     }
@@ -83,14 +83,14 @@ impl PeerBody {
         true
     }
 
-    /// Whether ticks are to be gone through again.
+    /// Whether ticks are to be stepped again.
     pub(crate) fn is_behind(&self) -> bool {
         self.pass.is_some()
     }
 
     /// Goes on with the pass until it is done or the budget is used up. Returns what is left of
     /// the budget.
-    pub(crate) fn go_through(&mut self, inputs: &InputLog, mut budget: u64) -> u64 {
+    pub(crate) fn resimulate(&mut self, inputs: &InputLog, mut budget: u64) -> u64 {
         while budget > 0 && self.pass.is_some() {
             budget = budget.saturating_sub(self.go_on(inputs));
         }

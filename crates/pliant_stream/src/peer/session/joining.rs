@@ -1,4 +1,4 @@
-//! Who comes and who leaves.
+//! Peers that join and peers that leave.
 
 use std::time::Duration;
 
@@ -191,7 +191,7 @@ impl PeerSession {
         if let Some(last) = self.inputs.users.get(&user).and_then(|inputs| inputs.newest()).cloned() {
             let from = last.tick + 1;
             let bodies = self.changed_by(user, &InputTick { tick: from, ..InputTick::default() });
-            let again = self.ticks_again(&bodies, from);
+            let again = self.ticks_to_resimulate(&bodies, from);
             // Without a hand in its last input, nothing was extrapolated.
             if again > 0 {
                 // The user pays for the ticks as for a late input. Otherwise a state repairs all.

@@ -9,14 +9,14 @@ use super::{
 use crate::peer::body::CONTACT_COST;
 use crate::wire::{Datagram, HeldAt, InputTick, Inputs, MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TICKS, NackRun};
 
-/// What an update spends on ticks that are gone through again, in steps without hands. On top of it
+/// What an update spends on ticks that are stepped again, in steps without hands. On top of it
 /// each body goes on by one tick with each step, so that none comes farther behind.
-const AGAIN: u64 = 192;
+const RESIMULATED: u64 = 192;
 /// Pause between requests for the same tick.
 const REQUEST_INTERVAL: Duration = Duration::from_millis(150);
 
 impl PeerSession {
-    /// Begins to go through what has changed by late inputs.
+    /// Begins to step again what late inputs have changed.
     pub(super) fn roll_back(&mut self) {
         let mut too_late = false;
         for body in self.bodies.values_mut() {
@@ -30,26 +30,26 @@ impl PeerSession {
         }
     }
 
-    /// Goes through past ticks again, as far as an update may. The bodies have their turns.
-    pub(super) fn go_through(&mut self) {
+    /// Steps past ticks again, as far as an update may. The bodies have their turns.
+    pub(super) fn resimulate(&mut self) {
         let behind = |(id, body): (&BodyId, &PeerBody)| body.is_behind().then_some(*id);
         let ids: Vec<BodyId> =
             self.bodies.range(self.turn..).chain(self.bodies.range(..self.turn)).filter_map(behind).collect();
-        let mut left = AGAIN;
+        let mut left = RESIMULATED;
         for id in ids {
             if left == 0 {
                 self.turn = id;
                 return;
             }
             if let Some(body) = self.bodies.get_mut(&id) {
-                left = body.go_through(&self.inputs, left);
+                left = body.resimulate(&self.inputs, left);
             }
         }
     }
 
     /// The newest tick whose state has all inputs that are known, of all bodies.
-    pub(super) fn settled(&self) -> Tick {
-        self.bodies.values().map(PeerBody::settled).fold(self.tick, Tick::min)
+    pub(super) fn resimulated_to(&self) -> Tick {
+        self.bodies.values().map(PeerBody::resimulated_to).fold(self.tick, Tick::min)
     }
 
     /// The bodies that an input of a user changes: those on which it acts, and those on which the
@@ -64,11 +64,11 @@ impl PeerSession {
         bodies
     }
 
-    /// The number of ticks that are gone through again if one changes for some bodies.
-    pub(super) fn ticks_again(&self, bodies: &[BodyId], tick: Tick) -> u64 {
+    /// The number of ticks that are stepped again if one changes for some bodies.
+    pub(super) fn ticks_to_resimulate(&self, bodies: &[BodyId], tick: Tick) -> u64 {
         let tick = tick.max(self.taken + 1);
-        let settled = bodies.iter().filter_map(|id| self.bodies.get(id)).map(PeerBody::settled);
-        settled.max().map_or(0, |settled| (settled + 1).saturating_sub(tick))
+        let resimulated_to = bodies.iter().filter_map(|id| self.bodies.get(id)).map(PeerBody::resimulated_to);
+        resimulated_to.max().map_or(0, |resimulated_to| (resimulated_to + 1).saturating_sub(tick))
     }
 
     /// Marks a tick that has changed for some bodies. What is before the last state that was taken
@@ -146,7 +146,7 @@ impl PeerSession {
 }
 
 /// Pays for an input from the budgets of its sender and of all, and returns whether they allow it:
-/// the ticks that are gone through `again` for it, and the patches that no body has yet.
+/// the ticks that are stepped `again` for it, and the patches that no body has yet.
 pub(super) fn affords(
     now: Duration,
     (other, all): (&mut RemotePeer, &mut SharedBudgets),

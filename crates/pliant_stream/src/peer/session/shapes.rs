@@ -54,7 +54,7 @@ impl PeerSession {
     /// Takes shapes that were due ([`PeerSession::shapes_to_make`]); `None` where none can be made.
     /// Shapes of other places are ignored, and those of another model act as none.
     ///
-    /// Where their tick has passed, the body goes through its ticks again from there, and where it
+    /// Where their tick has passed, the body steps its ticks again from there, and where it
     /// is not remembered any more, this peer requests a state.
     pub fn take_shapes(&mut self, body: BodyId, places: &[HeldPlace], shapes: Option<Arc<HeldShapes>>) {
         let leads = self.leads();
@@ -158,7 +158,7 @@ impl PeerSession {
         }
         // A set that is made already, and came too late, is like a late input.
         let first = from.max(self.taken + 1);
-        let again = (known.settled() + 1).saturating_sub(first);
+        let again = (known.resimulated_to() + 1).saturating_sub(first);
         let cost = late_cost((&self.bodies, &self.inputs), &InputTick::default(), again);
         if again == 0 || other.pays_for_late(&mut self.shared, now, cost) {
             self.mark(&[body], first);

@@ -133,7 +133,7 @@ impl PeerSession {
             self.others.iter().filter(|(_, o)| o.wants_state && o.user.is_some()).map(|(p, _)| *p).collect();
         // A peer that has just joined has no inputs yet and must not hold the confirmed tick back.
         let each = self.inputs.users.values().filter(|u| !u.gone && u.first <= self.tick);
-        let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.settled());
+        let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.resimulated_to());
         if wanting.is_empty() || tick == 0 || self.out.len() >= MAX_OUT {
             return;
         }

@@ -10,13 +10,13 @@ const KEPT: usize = 64;
 
 /// A malicious member: what it has sent, to be sent again or altered.
 #[derive(Debug, Default)]
-pub(super) struct Mischief {
+pub(super) struct Attacker {
     sent: Vec<(Channel, Vec<u8>)>,
     /// What it does now.
     pub(super) now: Option<FaultKind>,
 }
 
-impl Mischief {
+impl Attacker {
     /// Keeps what the member has sent.
     pub(super) fn keep(&mut self, random: &mut Random, channel: Channel, bytes: &[u8]) {
         if self.sent.len() < KEPT {

@@ -2,7 +2,7 @@
 //! systems of the plugin: resting, in motion, and in motion with a hand each. The frame of an app
 //! without bodies is subtracted.
 //!
-//! `cargo bench -p pliant_body --bench crowd`. With the name of a case, only that one runs,
+//! `cargo bench -p pliant_body --bench many`. With the name of a case, only that one runs,
 //! which is what a profiler wants.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a bench may stop")]
 

@@ -2,7 +2,7 @@
 //! what other processes (the relay, the host) cost meanwhile. `tests/watch/load.sh` runs it.
 //!
 //! ```sh
-//! watch_crowd RELAY CERTIFICATE SESSION BODY.modal WATCHERS SECONDS [NAME=PID...]
+//! watch_load RELAY CERTIFICATE SESSION BODY.modal WATCHERS SECONDS [NAME=PID...]
 //! ```
 //!
 //! CERTIFICATE is the hash of the relays' certificate, or `system` for what the system trusts.
@@ -55,12 +55,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("expected RELAY,.. CERTIFICATE SESSION BODY WATCHERS SECONDS [NAME=PID...]".into());
     };
     // What all watchers cost themselves is told beside the rest.
-    let processes: Vec<&str> = processes.iter().map(String::as_str).chain(["crowd=self"]).collect();
+    let processes: Vec<&str> = processes.iter().map(String::as_str).chain(["watchers=self"]).collect();
     let (watchers, seconds): (usize, f64) = (watchers.parse()?, seconds.parse()?);
     let model = session::model(Path::new(body))?;
     let relays: Vec<&str> = relays.split(',').collect();
     let began = Instant::now();
-    let mut crowd = Vec::new();
+    let mut followed = Vec::new();
     let options = relays.iter().map(|relay| match certificate.as_str() {
         "system" => Ok(RelayOptions::new(*relay, name)),
         hash => RelayOptions::new(*relay, name).with_certificate(hash).ok_or("CERTIFICATE is no hash"),
@@ -70,7 +70,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for some in all.chunks(A_THREAD) {
         let opened = Instant::now();
         let watchers = Watcher::open_all(some, vec![model.clone()])?;
-        crowd.extend(watchers.into_iter().map(|watcher| (opened, watcher, Heard::default())));
+        followed.extend(watchers.into_iter().map(|watcher| (opened, watcher, Heard::default())));
         // Not all handshakes in one moment.
         sleep(Duration::from_millis(5 * some.len() as u64));
     }
@@ -86,7 +86,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             break;
         }
         let mut idle = true;
-        for (opened, watcher, heard) in &mut crowd {
+        for (opened, watcher, heard) in &mut followed {
             while let Some(event) = watcher.poll() {
                 idle = false;
                 match event {
@@ -111,7 +111,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 }
             }
         }
-        let all = crowd.iter().all(|(_, _, heard)| heard.first_picture.is_some());
+        let all = followed.iter().all(|(_, _, heard)| heard.first_picture.is_some());
         if measured.is_none() && (all || began.elapsed() > Duration::from_secs(90)) {
             let used = processes.iter().filter_map(|one| {
                 let (name, pid) = one.split_once('=')?;
@@ -130,10 +130,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let part = |of: &[f64], share: f64| of.get((of.len() as f64 * share) as usize).copied().unwrap_or(0.0);
     let earliest = late.first().copied().unwrap_or(0.0);
     let mut pictures: Vec<f64> =
-        crowd.iter().filter_map(|(_, _, heard)| Some(heard.first_picture?.as_secs_f64())).collect();
+        followed.iter().filter_map(|(_, _, heard)| Some(heard.first_picture?.as_secs_f64())).collect();
     pictures.sort_by(f64::total_cmp);
-    let heard: u64 = crowd.iter().map(|(_, _, heard)| heard.count).sum();
-    let all = crowd.iter().map(|(_, _, heard)| heard);
+    let heard: u64 = followed.iter().map(|(_, _, heard)| heard.count).sum();
+    let all = followed.iter().map(|(_, _, heard)| heard);
     let newest = all.clone().map(|heard| heard.last).max().unwrap_or(0);
     let oldest = all.clone().filter(|heard| heard.count > 0).map(|heard| heard.first).min().unwrap_or(0);
     let due = |heard: &Heard| {
@@ -161,8 +161,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         pictures.last().copied().unwrap_or(0.0),
         1e3 * (part(&late, 0.5) - earliest),
         1e3 * (part(&late, 0.99) - earliest),
-        crowd.iter().map(|(_, _, heard)| heard.wrong).sum::<u64>(),
-        crowd.iter().map(|(_, _, heard)| heard.over).sum::<u64>(),
+        followed.iter().map(|(_, _, heard)| heard.wrong).sum::<u64>(),
+        followed.iter().map(|(_, _, heard)| heard.over).sum::<u64>(),
     );
     Ok(())
 }

@@ -2,11 +2,14 @@
 
     pip install numpy scipy
     cargo build --release -p pliant_cli
-    python docs/compare_eigensolver.py [--pliant target/release/pliant] [--modes 60] [--cells 24,8,8 ...]
+    python benches/compare_eigensolver.py [--pliant target/release/pliant] [--modes 60]
+        [--cells 24,8,8 ...]
 
-For each bar: `pliant bake --threads 1 --no-cache --export-matrices`, then `scipy.sparse.linalg.eigsh(K, k, M, sigma)` on the exported K and M.
-Printed: degrees of freedom, seconds of Pliant's factorisation and modes, seconds of eigsh (its factorisation in it), their ratio, and the
-largest relative difference of the eigenvalues. Leaves with 1 when one differs by more than 1e-8.
+For each bar: `pliant bake --threads 1 --no-cache --export-matrices`, then
+`scipy.sparse.linalg.eigsh(K, k, M, sigma)` on the exported K and M. Printed: degrees of freedom,
+seconds of Pliant's factorization and modes, seconds of eigsh (its factorization in it), their
+ratio, and the largest relative difference of the eigenvalues. Leaves with 1 when one differs by
+more than 1e-8.
 """
 
 import argparse
@@ -35,12 +38,12 @@ def measure(pliant, element, cells, modes, rounds):
         mesh, model = os.path.join(folder, "bar.msh"), os.path.join(folder, "bar.modal")
         x, y, z = (int(n) for n in cells.split(","))
         size = f"1,{y / x},{z / x}"
-        subprocess.run([pliant, "mesh", "bar", "--cells", cells, "--size", size, "-o", mesh], check=True,
-                       stdout=subprocess.DEVNULL)
-        bake = [pliant, "bake", mesh, "--element", element, "--modes", str(modes), "--poisson", "0.3",
-                "--anchor", "x<0.001", "--threads", "1", "--no-cache", "--export-matrices", folder,
-                "-o", model, "--json"]
-        # By turns, and the best of each: what else the machine does slows now the one, now the other.
+        bar = [pliant, "mesh", "bar", "--cells", cells, "--size", size, "-o", mesh]
+        subprocess.run(bar, check=True, stdout=subprocess.DEVNULL)
+        bake = [pliant, "bake", mesh, "--element", element, "--modes", str(modes)]
+        bake += ["--poisson", "0.3", "--anchor", "x<0.001", "--threads", "1", "--no-cache"]
+        bake += ["--export-matrices", folder, "-o", model, "--json"]
+        # By turns, and the best of each: other programs slow now the one, now the other.
         ours, theirs = math.inf, math.inf
         for _ in range(rounds):
             told = json.loads(subprocess.run(bake, check=True, capture_output=True).stdout)
@@ -52,8 +55,8 @@ def measure(pliant, element, cells, modes, rounds):
             theirs = min(theirs, time.perf_counter() - start)
         mine = (2 * np.pi * np.array(told["frequencies_hz"])) ** 2
         differ = float(np.max(np.abs(mine / np.sort(found) - 1)))
-        print(f"{element:>6} {cells:>10} {k.shape[0]:>7} {ours:>9.3f} {theirs:>9.3f} {theirs / ours:>6.2f} {differ:>9.1e}",
-              flush=True)
+        times = f"{ours:>9.3f} {theirs:>9.3f} {theirs / ours:>6.2f}"
+        print(f"{element:>6} {cells:>10} {k.shape[0]:>7} {times} {differ:>9.1e}", flush=True)
         return differ
 
 
@@ -71,7 +74,8 @@ def main():
     print("  element      cells     dof  pliant s   scipy s  ratio    differ")
     worst = 0.0
     for element in args.element or ["tet4", "tet10"]:
-        for cells in args.cells or (["30,10,10", "45,15,15"] if element == "tet4" else ["16,5,5", "27,9,9"]):
+        sizes = ["30,10,10", "45,15,15"] if element == "tet4" else ["16,5,5", "27,9,9"]
+        for cells in args.cells or sizes:
             worst = max(worst, measure(args.pliant, element, cells, args.modes, args.rounds))
     return 0 if worst <= 1e-8 else 1
 
