@@ -5,7 +5,8 @@
 //! watch_load RELAY CERTIFICATE SESSION BODY.modal WATCHERS SECONDS [NAME=PID...]
 //! ```
 //!
-//! CERTIFICATE is the hash of the relays' certificate, or `system` for what the system trusts.
+//! CERTIFICATE is the hash of the relays' certificate, or `system` for what the system trusts. With
+//! MODELS=fetch in the environment every watcher fetches the model; otherwise they have it.
 //!
 //! Prints a line of JSON. Delays are behind the earliest arrival of any tick at any watcher, by the
 //! host's count of ticks: the path's own delay on loopback is not in them. A frame that a watcher
@@ -33,6 +34,9 @@ const A_THREAD: usize = 50;
 #[derive(Default)]
 struct Heard {
     first_picture: Option<Duration>,
+    /// When the last frame came, and the longest time between two within the measured time.
+    before: Option<Instant>,
+    silence: Duration,
     /// First and last tick within the measured time, and the number of those heard.
     first: u64,
     last: u64,
@@ -58,6 +62,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let processes: Vec<&str> = processes.iter().map(String::as_str).chain(["watchers=self"]).collect();
     let (watchers, seconds): (usize, f64) = (watchers.parse()?, seconds.parse()?);
     let model = session::model(Path::new(body))?;
+    let fetch = std::env::var("MODELS").is_ok_and(|models| models == "fetch");
+    let known = if fetch { Vec::new() } else { vec![model] };
     let relays: Vec<&str> = relays.split(',').collect();
     let began = Instant::now();
     let mut followed = Vec::new();
@@ -69,7 +75,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let all: Vec<RelayOptions> = options.iter().cycle().take(watchers).cloned().collect();
     for some in all.chunks(A_THREAD) {
         let opened = Instant::now();
-        let watchers = Watcher::open_all(some, vec![model.clone()])?;
+        let watchers = Watcher::open_all(some, known.clone())?;
         followed.extend(watchers.into_iter().map(|watcher| (opened, watcher, Heard::default())));
         // Not all handshakes in one moment.
         sleep(Duration::from_millis(5 * some.len() as u64));
@@ -97,6 +103,10 @@ fn main() -> Result<(), Box<dyn Error>> {
                     WatchEvent::State(_, state) => {
                         heard.first_picture.get_or_insert(opened.elapsed());
                         if measured.is_some() {
+                            let came = Instant::now();
+                            let silent =
+                                heard.before.replace(came).map_or(Duration::ZERO, |before| came - before);
+                            heard.silence = heard.silence.max(silent);
                             if heard.count == 0 {
                                 heard.first = state.tick;
                             }
@@ -154,13 +164,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     println!(
         "{{\"watchers\":{watchers},\"with_picture\":{},\"first_picture_s\":[{:.2},{:.2}],\"seconds\":{passed:.1},\
-         \"heard\":{heard},\"missing\":{missing},\"delay_ms\":[{:.1},{:.1}],\"wrong\":{},\"over\":{},\
+         \"heard\":{heard},\"missing\":{missing},\"delay_ms\":[{:.1},{:.1}],\"silence_s\":{:.2},\"wrong\":{},\"over\":{},\
          \"bytes_per_s\":{bytes:.0},\"packets_per_s\":{packets:.0}{costs}}}",
         pictures.len(),
         part(&pictures, 0.5),
         pictures.last().copied().unwrap_or(0.0),
         1e3 * (part(&late, 0.5) - earliest),
         1e3 * (part(&late, 0.99) - earliest),
+        followed.iter().map(|(_, _, heard)| heard.silence.as_secs_f64()).fold(0.0, f64::max),
         followed.iter().map(|(_, _, heard)| heard.wrong).sum::<u64>(),
         followed.iter().map(|(_, _, heard)| heard.over).sum::<u64>(),
     );

@@ -9,7 +9,9 @@ use bevy::platform::time::Instant;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalAsset, ModalBody, PliantDisplaySystems, VisualState};
 use pliant_modal::ModalModel;
-use pliant_stream::watch::{Catalog, CatalogBody, HandsPlayout, Playout, TickClock, WatchHand, WatchNumbers};
+use pliant_stream::watch::{
+    BodyPlayout, Catalog, CatalogBody, HandsPlayout, TickClock, WatchHand, WatchNumbers,
+};
 use pliant_stream::{BodyId, StepSettings};
 
 use super::WatchView;
@@ -67,7 +69,7 @@ pub(crate) struct Watched {
 struct WatchedBody {
     entity: Entity,
     body: CatalogBody,
-    playout: Playout,
+    playout: BodyPlayout,
 }
 
 /// Watches a session while the app runs. The app needs a [`WatchPlugin`].
@@ -215,7 +217,7 @@ impl Watched {
                 view_of(&body),
             ))
             .id();
-        let playout = Playout::new(body.every.into());
+        let playout = BodyPlayout::new(body.every.into());
         self.bodies.insert(body.id, WatchedBody { entity, body, playout });
     }
 

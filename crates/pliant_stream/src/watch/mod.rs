@@ -35,7 +35,7 @@ pub use body::{BodyDecoder, BodyEncoder, EncodedFrame, WatchConfig, WatchFrame, 
 pub use catalog::{Catalog, CatalogBody, CatalogCamera};
 pub use hands::{WatchHand, WatchHands, WatchNumbers};
 pub use pieces::{Assembler, MAX_PIECE, pieces};
-pub use playout::{HandsPlayout, Playout, TickClock};
+pub use playout::{BodyPlayout, HandsPlayout, TickClock};
 pub use surface::{WatchSurface, coordinate_steps};
 
 use crate::BodyId;

@@ -58,12 +58,12 @@ impl TickClock {
 
 /// The states of a body that are drawn or wait.
 #[derive(Debug, Clone)]
-pub struct Playout {
+pub struct BodyPlayout {
     every: u64,
     states: VecDeque<WatchedState>,
 }
 
-impl Playout {
+impl BodyPlayout {
     /// For a body with `every` ticks from one frame to the next.
     pub fn new(every: u64) -> Self {
         Self { every: every.max(1), states: VecDeque::new() }
@@ -188,7 +188,7 @@ mod tests {
     fn the_picture_moves_evenly_behind_late_arrivals() {
         let step = 1.0 / 60.0;
         let mut clock = TickClock::new(step);
-        let mut playout = Playout::new(2);
+        let mut playout = BodyPlayout::new(2);
         let mut seed = 1_u64;
         let (mut worst, mut q) = (0.0_f64, Vec::new());
         for frame in 0..600_u64 {
@@ -243,7 +243,7 @@ mod tests {
 
     #[test]
     fn sleep_new_counts_and_floods() {
-        let mut playout = Playout::new(2);
+        let mut playout = BodyPlayout::new(2);
         let mut q = Vec::new();
         assert_eq!(playout.at(0.0, &mut q), None);
         playout.push(state(100, 1.0, true));
