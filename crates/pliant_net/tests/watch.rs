@@ -19,7 +19,7 @@ use moq_net::{Timestamp, origin};
 use pliant_body::VisualState;
 use pliant_modal::ModalModel;
 use pliant_net::watch::{
-    PublishOptions, RelayOptions, WatchCommands, WatchPlugin, WatchState, WatchView, Watcher,
+    CatalogCamera, PublishOptions, RelayOptions, WatchCommands, WatchPlugin, WatchState, WatchView, Watcher,
 };
 use pliant_net::{NetHost, NetPlugin, RemoteHands};
 use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchSurface};
@@ -33,6 +33,8 @@ use watching::{NAME, Publisher, Seen, off, options};
 fn the_session_comes_through(at: RelayOptions) {
     let mut publish = PublishOptions::new(at.clone());
     publish.title = "A bar".into();
+    let camera = CatalogCamera { eye: [0.0, 1.0, 3.0], at: [0.5, 1.0, 0.0], field_of_view: 0.9 };
+    publish.cameras = vec![camera];
     publish.bodies.rate = 20.0;
     let mut host = Publisher::start(publish);
     let mut watcher = Watcher::open(&at, Vec::new()).unwrap();
@@ -47,6 +49,7 @@ fn the_session_comes_through(at: RelayOptions) {
         Ok(())
     });
     assert_eq!(seen.catalogs.last().unwrap().name, "A bar");
+    assert_eq!(seen.catalogs.last().unwrap().cameras, [camera]);
     let entry = seen.catalogs.last().unwrap().bodies[0].clone();
     assert_eq!((entry.name.as_str(), entry.every, entry.modes), ("bar", 2, 4));
     assert!((entry.placement.scale - 2.0).abs() < 1e-6);

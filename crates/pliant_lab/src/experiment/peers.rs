@@ -229,7 +229,7 @@ impl Experiment {
         let (mut force, mut force_motion, mut forces) = (0.0, 0.0, 0_u64);
         let (mut above, mut longest) = (None, Duration::ZERO);
         let mut hash = 0xCBF2_9CE4_8422_2325;
-        let mut picture = None;
+        let mut picture = seen.get(&first);
         for (tick, real) in truth {
             // The picture of the last tick that was shown stands in the place of one that was not.
             if let Some(shown) = seen.get(&tick) {
