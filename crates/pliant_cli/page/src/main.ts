@@ -7,7 +7,7 @@
 import { Connection, Path } from "@moq/net";
 import type { Broadcast } from "@moq/net";
 import { shapeOf } from "./format";
-import { Playout } from "./playout";
+import { HandsPlayout, Playout } from "./playout";
 import { Plot } from "./plot";
 import { Stage } from "./scene";
 import { Notes, Session, type View } from "./session";
@@ -52,6 +52,7 @@ const hooks = {
   numbers: notes.numbers,
   record: () => {
     notes.recorded = [];
+    notes.recordedHands = [];
   },
   wrongs: () => [...notes.wrongs],
   bodies: () => [...(session?.bodies.keys() ?? [])],
@@ -80,6 +81,8 @@ const hooks = {
   /** Draws one decoded tick and stays there. */
   freeze: (tick: number) => {
     notes.frozen = tick;
+    if (session) session.handsPlayout = new HandsPlayout();
+    for (const hands of notes.recordedHands) if (hands.tick <= tick) session?.handsPlayout.push(hands);
     for (const body of session?.bodies.keys() ?? []) {
       const one = found(body, tick);
       if (!one) continue;

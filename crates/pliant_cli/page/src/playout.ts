@@ -1,9 +1,11 @@
 // Which states to draw at which time: a little behind the host, so that there is a next state.
 
-import type { State } from "./format";
+import type { Hand, Hands, State, Vector } from "./format";
 
-/** Most states of a body that wait to be drawn. */
+/** Most states of a body, and most messages with hands, that wait to be drawn. */
 const MOST = 64;
+/** Number of ticks by which a message with hands may be older than what was heard last. */
+const OVERLAP = 1000;
 /** How long the earliest arrivals count, ms. */
 const WINDOW = 5000;
 
@@ -77,5 +79,47 @@ export class Playout {
     if (!from || !to) return undefined;
     const part = to.tick > from.tick ? (tick - from.tick) / (to.tick - from.tick) : 0;
     return [from, to, Math.min(Math.max(part, 0), 1)];
+  }
+}
+
+/** Which hand it is: of which body, of whom, and which one of theirs. */
+export const keyOf = (hand: Hand) => `${hand.body}/${hand.user}/${hand.grab}`;
+
+/** The messages with hands that are drawn or wait. */
+export class HandsPlayout {
+  #messages: Hands[] = [];
+
+  push(hands: Hands): void {
+    const messages = this.#messages;
+    const last = messages[messages.length - 1];
+    if (last && hands.tick <= last.tick) {
+      // Two groups that overlap, or a new count of ticks, as of a body's states.
+      if (last.tick - hands.tick < OVERLAP) return;
+      messages.length = 0;
+    }
+    messages.push(hands);
+    if (messages.length > MOST) messages.shift();
+  }
+
+  /**
+   * The hands at a tick. A hand that both messages around the tick have goes straight from one to
+   * the other. One that only the first has stays until the tick of the second, and one that only
+   * the second has appears there: nothing says when it came or went in between.
+   */
+  at(tick: number): Hand[] {
+    const messages = this.#messages;
+    while (messages.length > 1 && messages[1]!.tick <= tick) messages.shift();
+    const [from, to] = messages;
+    if (!from || from.tick > tick) return [];
+    if (!to) return from.hands;
+    const part = (tick - from.tick) / (to.tick - from.tick);
+    const next = new Map(to.hands.map((hand) => [keyOf(hand), hand]));
+    return from.hands.map((hand) => {
+      const then = next.get(keyOf(hand));
+      if (!then) return hand;
+      const between = (a: Vector, b: Vector) => a.map((x, k) => x + (b[k]! - x) * part) as Vector;
+      const target = between(hand.target, then.target);
+      return { ...hand, target, reaction: between(hand.reaction, then.reaction) };
+    });
   }
 }

@@ -3,7 +3,8 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import type { Catalog, CatalogBody, Hand, State, Surface } from "./format";
+import { type Catalog, type CatalogBody, type Hand, type State, type Surface, WrongData } from "./format";
+import { keyOf } from "./playout";
 
 const VERTEX = /* glsl */ `
 precision highp float;
@@ -84,6 +85,8 @@ function widened(rows: Float32Array): Float32Array {
   return out;
 }
 
+const TOO_LARGE = "a model is too large for this graphics card";
+
 /** A model on the graphics card, for all of its bodies. */
 export class Model {
   readonly surface: Surface;
@@ -96,7 +99,7 @@ export class Model {
     this.surface = surface;
     const rows = (surface.modes * surface.positions.length) / 3;
     this.across = Math.max(1, Math.min(4096, largest, rows));
-    if (Math.ceil(rows / this.across) > largest) throw new Error("a model is too large for this graphics card");
+    if (Math.ceil(rows / this.across) > largest) throw new WrongData(TOO_LARGE);
     this.displacement = texture(widened(surface.displacement), 4, this.across);
     this.rotation = texture(widened(surface.rotation), 4, this.across);
     this.geometry.setAttribute("position", new THREE.BufferAttribute(surface.positions, 3));
@@ -122,14 +125,11 @@ export class Drawn {
     this.#body = body;
     this.#values = new Float32Array(Math.max(1, model.surface.modes));
     this.#coordinates = texture(this.#values, 1, this.#values.length);
-    const [r, g, b, a] = body.color;
-    const color = new THREE.Color().setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace);
     const material = new THREE.ShaderMaterial({
       glslVersion: THREE.GLSL3,
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
       side: THREE.DoubleSide,
-      transparent: a < 255,
       uniforms: {
         displacement: { value: model.displacement },
         rotation: { value: model.rotation },
@@ -138,16 +138,29 @@ export class Drawn {
         vertices: { value: model.surface.positions.length / 3 },
         across: { value: model.across },
         warps: { value: body.warps },
-        color: { value: color },
-        opacity: { value: a / 255 },
+        color: { value: new THREE.Color() },
+        opacity: { value: 1 },
       },
     });
     this.mesh = new THREE.Mesh(model.geometry, material);
     // The shader moves the vertices, so the bounds at rest say nothing.
     this.mesh.frustumCulled = false;
+    this.place(body);
+  }
+
+  /** Takes over where the body is, how large it is, and its color. */
+  place(body: CatalogBody): void {
+    this.#body = body;
     this.mesh.position.set(...body.position);
     this.mesh.quaternion.set(...body.orientation);
     this.mesh.scale.setScalar(body.scale);
+    const [r, g, b, a] = body.color;
+    const { material } = this.mesh;
+    material.uniforms.color!.value.setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace);
+    material.uniforms.opacity!.value = a / 255;
+    if (material.transparent === a < 255) return;
+    material.transparent = a < 255;
+    material.needsUpdate = true;
   }
 
   /** Draws the body between two states, `part` of the way from the first to the second. */
@@ -235,7 +248,7 @@ export class Stage {
   showHands(hands: Hand[], strongest: number): void {
     const present = new Set<string>();
     for (const hand of hands) {
-      const key = `${hand.body}/${hand.user}/${hand.grab}`;
+      const key = keyOf(hand);
       present.add(key);
       let shown = this.#hands.get(key);
       if (!shown) {

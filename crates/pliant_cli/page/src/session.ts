@@ -14,12 +14,13 @@ import {
   MAX_FRAME,
   MAX_SURFACE,
   type State,
+  type Surface,
   WrongData,
   readCatalog,
   readHands,
   readSurface,
 } from "./format";
-import { Playout, TickClock } from "./playout";
+import { HandsPlayout, Playout, TickClock } from "./playout";
 import { Drawn, Model } from "./scene";
 
 /** Time behind the earliest arrivals beside a frame's interval, ms: what a network is late. */
@@ -28,8 +29,16 @@ const MARGIN = 40;
 const MAX_DRAWN = 256;
 /** Most bytes of all surfaces of a session. */
 const MAX_SURFACES = 2 * MAX_SURFACE;
-/** How long the last group of a track that has ended may take, ms. */
-const LONGEST_GROUP = 60_000;
+/** Pause before a track that has ended is asked for again, ms. */
+const RETRY_PAUSE = 500;
+/** Longest pause before a surface is asked for again, ms. */
+const LONGEST_PAUSE = 4000;
+/** How long the last groups of a track that has ended may take, ms. */
+const LAST_GROUPS = 2000;
+/** How long a surface may pause on its way before it is asked for anew, ms. */
+const LONGEST_SILENCE = 30_000;
+/** From which age on the newest picture's age is told, ms. */
+const OLD = 2000;
 /** Most messages that are kept for measurements. */
 const MAX_WRONGS = 64;
 /** Most states that are kept for measurements. */
@@ -56,6 +65,7 @@ export class Notes {
   lastWrong = "";
   /** For measurements: what was decoded, and a tick to hold the picture at. */
   recorded: { body: number; state: State }[] | undefined;
+  recordedHands: Hands[] = [];
   frozen: number | undefined;
 
   checked(payload: Uint8Array): Uint8Array {
@@ -89,6 +99,33 @@ export interface Watched {
   model: Model;
   drawn: Drawn;
   playout: Playout;
+  /** When its newest frame arrived. */
+  heard: number;
+}
+
+/** A body that the catalog names, and what ends its tracks. */
+interface Wanted {
+  body: CatalogBody;
+  end: () => void;
+}
+
+/** Which surface it is. Of two catalogs that disagree on its length, each gets its own. */
+const surfaceOf = (body: CatalogBody) => `${body.model}/${body.surfaceBytes}`;
+
+/** Whether a body is decoded and drawn as another one: its name, place and color do not matter. */
+function alike(a: CatalogBody, b: CatalogBody): boolean {
+  const same = a.modes === b.modes && a.every === b.every && a.free === b.free && a.warps === b.warps;
+  return same && surfaceOf(a) === surfaceOf(b);
+}
+
+/** Waits, and returns earlier if `gone` settles. The timer does not stay. */
+async function pause(ms: number, gone: Promise<unknown>): Promise<void> {
+  let timer: ReturnType<typeof setTimeout> | undefined;
+  const over = new Promise((done) => {
+    timer = setTimeout(done, ms);
+  });
+  await Promise.race([over, gone]);
+  clearTimeout(timer);
 }
 
 /** One broadcast, from its catalog to its end. */
@@ -96,12 +133,20 @@ export class Session {
   readonly broadcast: Broadcast.Consumer;
   readonly bodies = new Map<number, Watched>();
   /** Bodies whose model or frames are on the way. */
-  readonly wanted = new Map<number, { body: CatalogBody; end: () => void }>();
+  readonly wanted = new Map<number, Wanted>();
   readonly models = new Map<string, { bytes: number; ready: Promise<Model>; end: () => void }>();
   catalog: Catalog | undefined;
   clock = new TickClock(1 / 60);
+  /** The newest hands, and when they arrived. */
   hands: Hands | undefined;
+  handsHeard = 0;
+  handsPlayout = new HandsPlayout();
   ended = false;
+  #over: () => void = () => {};
+  /** Settles when the session ends. */
+  #end = new Promise<void>((done) => {
+    this.#over = done;
+  });
   #view: View;
   #notes: Notes;
 
@@ -112,14 +157,13 @@ export class Session {
   }
 
   start(): void {
-    this.#follow("catalog", 0, async (group) => {
+    this.#follow("catalog", 3, async (group) => {
       const frame = await group.readFrame();
       if (frame) this.#read(readCatalog(this.#notes.checked(frame.payload)));
     });
-    this.#follow("hands", 2, async (group) => {
+    this.#follow("hands", 1, async (group) => {
       for (let frame = await group.readFrame(); frame && !this.ended; frame = await group.readFrame()) {
-        this.hands = readHands(this.#notes.checked(frame.payload));
-        this.#view.heard(this.hands);
+        this.#heard(readHands(this.#notes.checked(frame.payload)));
       }
     });
   }
@@ -154,16 +198,15 @@ export class Session {
             open.push({ group, read: one(group) });
             if (open.length > 2) open.shift()?.group.close();
           }
-          // A model's track ends while its group is on the way.
-          const late = new Promise((end) => setTimeout(end, LONGEST_GROUP));
-          await Promise.race([late, Promise.all(open.map((one) => one.read))]);
+          // A track may end while its last groups are on the way.
+          await pause(LAST_GROUPS, Promise.race([this.#end, Promise.all(open.map((one) => one.read))]));
         } catch (error) {
           this.#told(error);
         }
         for (const { group } of open) group.close();
         track?.close();
         // A track that ended may come again, but not at once.
-        await new Promise((later) => setTimeout(later, 500));
+        await pause(RETRY_PAUSE, this.#end);
       }
     };
     void run();
@@ -174,23 +217,32 @@ export class Session {
   }
 
   #read(catalog: Catalog): void {
-    if (this.catalog?.session !== catalog.session || this.catalog.step !== catalog.step) {
+    const other = this.catalog?.session !== catalog.session || this.catalog.step !== catalog.step;
+    if (other) {
       this.clock = new TickClock(catalog.step);
+      this.handsPlayout = new HandsPlayout();
     }
     this.catalog = catalog;
     this.#view.title(catalog.name);
     const named = new Map(catalog.bodies.map((body) => [body.id, body]));
-    for (const [id, { body, end }] of this.wanted) {
+    for (const [id, wanted] of this.wanted) {
       const now = named.get(id);
-      if (now && JSON.stringify(now) === JSON.stringify(body)) continue;
-      end();
+      if (now && !other && alike(now, wanted.body)) {
+        wanted.body = now;
+        const watched = this.bodies.get(id);
+        if (!watched) continue;
+        watched.body = now;
+        watched.drawn.place(now);
+        continue;
+      }
+      wanted.end();
       this.#remove(id);
       this.wanted.delete(id);
     }
-    const kept = new Set(catalog.bodies.map((body) => body.model));
-    for (const [hash, model] of this.models) {
-      if (kept.has(hash)) continue;
-      this.models.delete(hash);
+    const kept = new Set(catalog.bodies.map(surfaceOf));
+    for (const [key, model] of this.models) {
+      if (kept.has(key)) continue;
+      this.models.delete(key);
       model.end();
     }
     for (const body of catalog.bodies) {
@@ -203,75 +255,138 @@ export class Session {
   #want(body: CatalogBody): void {
     let over = false;
     let stop = () => {};
-    this.wanted.set(body.id, {
+    const wanted: Wanted = {
       body,
       end: () => {
         over = true;
         stop();
       },
-    });
+    };
+    this.wanted.set(body.id, wanted);
     const begin = (model: Model) => {
       if (over || this.ended) return;
       const places = model.surface.places.subarray(0, body.modes);
-      stop = this.#follow(`body/${body.id}`, 1, async (group) => {
+      stop = this.#follow(`body/${body.id}`, 2, async (group) => {
         // Two groups may overlap for a moment, so each has a decoder of its own.
         const decoder = new BodyDecoder(places);
         for (let frame = await group.readFrame(); frame && !over; frame = await group.readFrame()) {
-          this.#arrived(body, model, decoder.decode(this.#notes.checked(frame.payload)));
+          this.#arrived(wanted.body, model, decoder.decode(this.#notes.checked(frame.payload)));
         }
       });
     };
-    this.#model(body).then(begin, (error) => this.#told(error));
+    void this.#model(body).then(begin);
   }
 
+  /** The model of a body, which is fetched once for all bodies that have it. */
   #model(body: CatalogBody): Promise<Model> {
-    const known = this.models.get(body.model);
+    const key = surfaceOf(body);
+    const known = this.models.get(key);
     if (known) return known.ready;
-    let bytes = body.surfaceBytes;
-    for (const other of this.models.values()) bytes += other.bytes;
-    if (!(bytes <= MAX_SURFACES)) return Promise.reject(new WrongData("the session's models are too large"));
     let gone = false;
     let stop = () => {};
     let made: Model | undefined;
-    const ready = new Promise<Model>((done) => {
-      stop = this.#follow(`surface/${body.model}`, 0, async (group) => {
-        const assembler = new Assembler(body.surfaceBytes);
-        for (let frame = await group.readFrame(); frame && !gone; frame = await group.readFrame()) {
-          const whole = assembler.push(this.#notes.checked(frame.payload));
-          this.#sayBefore(`model: ${Math.round(100 * assembler.progress)} %`);
-          if (!whole) continue;
-          const surface = readSurface(whole);
-          if (surface.model !== body.model) throw new WrongData("a surface is of another model");
-          stop();
-          if (made) return;
-          made = new Model(surface, this.#view.largestTexture);
-          done(made);
-          return;
-        }
-      });
+    const over = new Promise<void>((done) => {
+      stop = done;
     });
     const end = () => {
       gone = true;
       stop();
       made?.dispose();
     };
-    this.models.set(body.model, { bytes: body.surfaceBytes, ready, end });
+    const fetch = async (done: (model: Model) => void) => {
+      // A host writes a surface once for each that asks, so that whoever has not got it asks again.
+      for (let wait = RETRY_PAUSE; !gone && !this.ended; wait = Math.min(2 * wait, LONGEST_PAUSE)) {
+        let surface: Surface | undefined;
+        try {
+          surface = await this.#surface(body, Promise.race([over, this.#end]));
+        } catch (error) {
+          this.#told(error);
+        }
+        if (gone || this.ended) return;
+        if (!surface) {
+          await pause(wait, Promise.race([over, this.#end]));
+          continue;
+        }
+        try {
+          made = new Model(surface, this.#view.largestTexture);
+          done(made);
+        } catch (error) {
+          // It would not get smaller.
+          this.#told(error);
+        }
+        return;
+      }
+    };
+    const ready = new Promise<Model>((done) => void fetch(done));
+    this.models.set(key, { bytes: body.surfaceBytes, ready, end });
     return ready;
   }
 
+  /** Asks for a surface, and reads it. Returns nothing when it was cut off. */
+  async #surface(body: CatalogBody, gone: Promise<unknown>): Promise<Surface | undefined> {
+    const assembler = new Assembler(body.surfaceBytes);
+    let bytes = 0;
+    for (const model of this.models.values()) bytes += model.bytes;
+    if (bytes > MAX_SURFACES) throw new WrongData("the session's models are too large");
+    const track = this.broadcast.track(`surface/${body.model}`).subscribe({ priority: 0, latencyMax: 300 });
+    let group: Group.Consumer | undefined;
+    // Whoever closes what is read ends the reading. The next try begins with a line of its own.
+    const close = () => {
+      group?.close();
+      track.close();
+    };
+    let heard = performance.now();
+    const silence = setInterval(() => {
+      if (performance.now() - heard > LONGEST_SILENCE) close();
+    }, 1000);
+    void gone.then(close);
+    try {
+      group = await track.nextGroup();
+      if (group) this.#notes.numbers.groups++;
+      for (let frame = await group?.readFrame(); frame; frame = await group?.readFrame()) {
+        heard = performance.now();
+        const whole = assembler.push(this.#notes.checked(frame.payload));
+        this.#sayBefore(`model: ${Math.round(100 * assembler.progress)} %`);
+        if (!whole) continue;
+        const surface = readSurface(whole);
+        if (surface.model !== body.model) throw new WrongData("a surface is of another model");
+        return surface;
+      }
+      return undefined;
+    } finally {
+      clearInterval(silence);
+      close();
+    }
+  }
+
+  #heard(hands: Hands): void {
+    const now = performance.now();
+    // Hands come while all bodies rest, too, and say which tick it is.
+    this.clock.arrived(hands.tick, now);
+    const { recorded, recordedHands, frozen } = this.#notes;
+    if (recorded && recordedHands.length < MAX_RECORDED) recordedHands.push(hands);
+    if (frozen === undefined) this.handsPlayout.push(hands);
+    this.hands = hands;
+    this.handsHeard = now;
+    this.#view.heard(hands);
+  }
+
   #arrived(body: CatalogBody, model: Model, state: State): void {
-    this.clock.arrived(state.tick, performance.now());
+    const now = performance.now();
+    // Who comes late gets the last frame of a body that rests, however long ago it was.
+    if (!state.resting) this.clock.arrived(state.tick, now);
     const recorded = this.#notes.recorded;
     if (recorded && recorded.length < MAX_RECORDED) recorded.push({ body: body.id, state });
     let watched = this.bodies.get(body.id);
     if (!watched) {
-      watched = { body, model, drawn: new Drawn(body, model), playout: new Playout(body.every) };
+      watched = { body, model, drawn: new Drawn(body, model), playout: new Playout(body.every), heard: now };
       watched.drawn.show(state, state, 0);
       this.bodies.set(body.id, watched);
       this.#view.scene.add(watched.drawn.mesh);
       const numbers = this.#notes.numbers;
-      if (numbers.firstPicture === 0) numbers.firstPicture = performance.now() - numbers.began;
+      if (numbers.firstPicture === 0) numbers.firstPicture = now - numbers.began;
     }
+    watched.heard = now;
     if (this.#notes.frozen === undefined) watched.playout.push(state);
   }
 
@@ -296,9 +411,11 @@ export class Session {
   draw(now: number): void {
     const catalog = this.catalog;
     if (!catalog) return;
+    const due = (every: number) => {
+      return this.#notes.frozen ?? this.clock.tick(now, every * catalog.step * 1000 + MARGIN);
+    };
     for (const { body, drawn, playout } of this.bodies.values()) {
-      const delay = body.every * catalog.step * 1000 + MARGIN;
-      const tick = this.#notes.frozen ?? this.clock.tick(now, delay);
+      const tick = due(body.every);
       const pair = tick === undefined ? undefined : playout.at(tick);
       if (pair) drawn.show(...pair);
     }
@@ -306,18 +423,43 @@ export class Session {
       catalog,
       [...this.bodies.values()].map((watched) => watched.drawn),
     );
-    this.#view.showHands(this.hands?.hands ?? []);
+    // A host has one rate for hands and all bodies.
+    const tick = due(Math.max(1, ...catalog.bodies.map((body) => body.every)));
+    this.#view.showHands(tick === undefined ? [] : this.handsPlayout.at(tick));
     if (this.bodies.size > 0) {
       const people = this.hands ? `${this.hands.people} in the session, ` : "";
       const { numbers, lastWrong } = this.#notes;
       const wrong = numbers.wrong > 0 ? `, ${numbers.wrong} wrong: ${lastWrong}` : "";
       const bodies = this.bodies.size === 1 ? "1 body" : `${this.bodies.size} bodies`;
-      this.#view.say(`${people}${bodies}, ${(numbers.bytes / 1024).toFixed(0)} KiB${wrong}`);
+      this.#view.say(`${people}${bodies}${this.#age(now)}, ${(numbers.bytes / 1024).toFixed(0)} KiB${wrong}`);
     }
+  }
+
+  /**
+   * How old the newest picture is, where it is old. A body that rests has no frames, so that if all
+   * do, hands' messages tell whether the host is there: they come all the time.
+   */
+  #age(now: number): string {
+    const step = this.catalog?.step ?? 0;
+    const all = [...this.bodies.values()];
+    const awake = all.filter(({ playout }) => !playout.newest?.resting);
+    const old = awake.filter(({ body, heard }) => now - heard > Math.max(OLD, 2000 * body.every * step));
+    const since = (heard: number) => `nothing new for ${Math.floor((now - heard) / 1000)} s`;
+    if (awake.length === 0) {
+      const heard = Math.max(this.handsHeard, ...all.map((body) => body.heard));
+      const longest = Math.max(OLD, ...all.map(({ body }) => 2000 * body.every * step));
+      return now - heard > longest ? `, ${since(heard)}` : "";
+    }
+    if (old.length === 0) return "";
+    if (old.length === awake.length) return `, ${since(Math.max(...old.map((body) => body.heard)))}`;
+    const of = old.length === 1 ? "1 body" : `${old.length} bodies`;
+    const heard = Math.min(...old.map((body) => body.heard));
+    return `, ${since(heard).replace(" for", ` of ${of} for`)}`;
   }
 
   end(): void {
     this.ended = true;
+    this.#over();
     for (const { end } of this.wanted.values()) end();
     for (const id of [...this.bodies.keys()]) this.#remove(id);
     for (const model of this.models.values()) model.end();

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { Playout, TickClock } from "../node_modules/.watch-test/playout.mjs";
+import { HandsPlayout, Playout, TickClock } from "../node_modules/.watch-test/playout.mjs";
 
 const state = (tick, x, resting = false) => ({ tick, q: Float64Array.of(x), resting });
 const drawn = (playout, tick) => {
@@ -42,4 +42,29 @@ test("the clock follows the earliest arrivals", () => {
   }
   clock.arrived(7, 30_000);
   assert.ok(Math.abs(clock.tick(30_000, 0) - 7) < 1e-9);
+});
+
+test("hands go straight between two messages, and come and go at their own ticks", () => {
+  const playout = new HandsPlayout();
+  const hand = (user, x) => ({ body: 1, user, grab: 0, target: [x, 0, 0], reaction: [0, -x, 0] });
+  const shown = (tick) => Object.fromEntries(playout.at(tick).map((one) => [one.user, one]));
+  assert.deepEqual(playout.at(0), []);
+  playout.push({ tick: 100, hands: [hand(1, 10), hand(2, 0)] });
+  playout.push({ tick: 104, hands: [hand(1, 14), hand(3, 0)] });
+  playout.push({ tick: 102, hands: [] });
+  assert.deepEqual(playout.at(99), []);
+  let now = shown(101);
+  assert.deepEqual([now[1].target, now[1].reaction], [[11, 0, 0], [0, -11, 0]]);
+  assert.deepEqual(Object.keys(now), ["1", "2"]);
+  assert.deepEqual(Object.keys(shown(103.9)), ["1", "2"]);
+  now = shown(104);
+  assert.deepEqual(Object.keys(now), ["1", "3"]);
+  assert.deepEqual(shown(1e9)[1].target, [14, 0, 0], "beyond the newest they stay");
+  for (let tick = 105; tick < 1000; tick++) playout.push({ tick, hands: [] });
+  assert.deepEqual(playout.at(900), [], "of many messages the last ones are there");
+  playout.push({ tick: 3, hands: [hand(7, 1)] });
+  assert.deepEqual(playout.at(3), [], "a message from before is left out");
+  playout.push({ tick: 5000, hands: [] });
+  playout.push({ tick: 3, hands: [hand(7, 1)] });
+  assert.deepEqual(Object.keys(shown(3)), ["7"], "a host that has started again counts from the beginning");
 });
