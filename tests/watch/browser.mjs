@@ -107,7 +107,8 @@ export class Browser {
     const about = `${method} ${(params.expression ?? params.url ?? "").slice(0, 80)}`.trim();
     return within(ms, `the browser's answer to ${about}`, answer).finally(() => this.#waiting.delete(id));
   }
-  async open(url) {
+  /** Opens a page in a tab of its own; `first` runs before its scripts. */
+  async open(url, first) {
     const { targetId } = await this.send("Target.createTarget", { url: "about:blank" }, null);
     const attached = await this.send("Target.attachToTarget", { targetId, flatten: true }, null);
     this.#session = attached.sessionId;
@@ -115,6 +116,7 @@ export class Browser {
     await this.send("Inspector.enable");
     await this.send("Page.enable");
     await this.send("Runtime.enable");
+    if (first) await this.send("Page.addScriptToEvaluateOnNewDocument", { source: first });
     await this.send("Page.navigate", { url });
   }
   /** The value of an expression in the page. */
@@ -127,9 +129,26 @@ export class Browser {
   }
   /** What the page says, and what it said to its console. */
   async state() {
-    const expression = "`${document.body.innerText}\\n${pliant.wrongs().join()}\\n${JSON.stringify(pliant.numbers)}`";
+    const expression = "`${document.body.innerText}\\n${window.pliant?.wrongs().join()}\\n${JSON.stringify(window.pliant?.numbers)}`";
     const text = await within(3000, "the page's answer", this.value(expression)).catch((error) => `${error}`);
     return `${text}\n${this.#said.join("\n")}`;
+  }
+  /** Makes the page's screen that of a phone. */
+  async phone(width, height) {
+    await this.send("Emulation.setTouchEmulationEnabled", { enabled: true, maxTouchPoints: 2 });
+    const metrics = { width, height, deviceScaleFactor: 2, mobile: true };
+    await this.send("Emulation.setDeviceMetricsOverride", metrics);
+  }
+  /** Fingers that go from places to places, each an array of x and y. */
+  async touch(from, to, steps = 12) {
+    const points = (part) =>
+      from.map(([x, y], k) => ({ x: x + (to[k][0] - x) * part, y: y + (to[k][1] - y) * part, id: k }));
+    await this.send("Input.dispatchTouchEvent", { type: "touchStart", touchPoints: points(0) });
+    for (let step = 1; step <= steps; step++) {
+      await this.send("Input.dispatchTouchEvent", { type: "touchMove", touchPoints: points(step / steps) });
+      await sleep(16);
+    }
+    await this.send("Input.dispatchTouchEvent", { type: "touchEnd", touchPoints: [] });
   }
   async picture(file) {
     const { data } = await this.send("Page.captureScreenshot", { format: "png" });

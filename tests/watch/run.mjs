@@ -8,6 +8,7 @@ import { createServer as createHttpServer } from "node:http";
 import { createServer as listen } from "node:net";
 import { join } from "node:path";
 import { Browser, endAfter, serve, sleep, start, until, within } from "./browser.mjs";
+import { expected, extent, overlap, unpacked } from "./silhouette.mjs";
 
 const { RELAY, CHROMIUM, BIN, WORK, OUT } = process.env;
 const HZ = 60;
@@ -123,6 +124,11 @@ endAfter(240_000, () => browser.state());
 const address = await link;
 assert.ok(address.startsWith(pageAddress) && address.includes(hash), address);
 assert.ok(!address.includes("of-the-host"), "the host's token is not in the link");
+// Without a graphics card the page says so. Whatever it said before stays if it does not.
+const none = "HTMLCanvasElement.prototype.getContext = function () { return null; }";
+await browser.open(address, none);
+const line = "document.getElementById('status')?.textContent";
+await until(browser, "a word about the graphics card", async () => /WebGL 2/.test(await browser.value(line)));
 await browser.open(address);
 await until(browser, "the first picture", () => browser.value("pliant.numbers.firstPicture > 0"));
 told.firstPicture = (await browser.value("pliant.numbers.firstPicture")) / 1000;
@@ -175,6 +181,60 @@ if (OUT !== WORK && existsSync(drawer)) {
   const given = [trace, body, `${furthest}`, join(OUT, "host.png"), `${wide}`, `${high}`];
   told.hostPicture = spawnSync(drawer, given, { stdio: ["ignore", "ignore", "inherit"], timeout: 130_000 }).status === 0;
 }
+
+// What the graphics card draws, against what must be seen of the host's truth from the same camera.
+const surface = await browser.value(`pliant.surface(${id}, ${furthest})`);
+async function picture(shape) {
+  const seen = await browser.value("pliant.drawn()");
+  const mask = unpacked(seen);
+  return { same: overlap(mask, expected(shape, surface, seen)), extent: extent(mask, seen.wide, seen.high), ...seen };
+}
+const bent = truth.ticks[furthest];
+const desk = await picture(bent);
+told.silhouette = desk.same;
+// The same test would see a body that is drawn at another tick.
+const others = Object.entries(truth.ticks).map(([tick, shape]) => [tick, overlap(unpacked(desk), expected(shape, surface, desk))]);
+told.silhouetteOfAnotherTick = Math.min(...others.map(([, same]) => same));
+assert.ok(told.silhouette > 0.98, `the picture is that of the body by ${told.silhouette}`);
+assert.ok(told.silhouetteOfAnotherTick < told.silhouette - 0.02, `${told.silhouetteOfAnotherTick}`);
+
+// On a phone the whole body is in the picture, lying and upright.
+const inside = ([left, right, low, top]) => left > 0.02 && right < 0.98 && low > 0.02 && top < 0.98;
+assert.ok(inside(desk.extent), `the body is at ${desk.extent} of the window`);
+for (const [wide, high] of [
+  [844, 390],
+  [390, 844],
+]) {
+  await browser.phone(wide, high);
+  await until(browser, "a phone's picture", async () => (await browser.value("innerWidth")) === wide);
+  await sleep(300);
+  const phone = await picture(bent);
+  const [left, right, low, top] = phone.extent;
+  told[`at ${wide} by ${high}`] = phone.extent.map((x) => x.toFixed(2)).join(" ");
+  assert.deepEqual([phone.wide, phone.high], [2 * wide, 2 * high]);
+  assert.ok(inside(phone.extent), `the body is at ${phone.extent} of the phone`);
+  assert.ok(Math.max((right - left) * wide, (top - low) * high) > 0.4 * Math.min(wide, high), `${phone.extent}`);
+  assert.ok(phone.same > 0.98, `the phone's picture is that of the body by ${phone.same}`);
+}
+await browser.picture(join(OUT, "page-phone.png"));
+
+// One finger turns the view, two zoom, and the page stays where it is.
+const away = ({ eye, target }) => Math.hypot(...eye.map((x, axis) => x - target[axis]));
+async function touched(from, to) {
+  const before = await browser.value("pliant.view()");
+  await browser.touch(from, to);
+  await sleep(500);
+  const page = await browser.value("[scrollX, scrollY, visualViewport.scale, visualViewport.offsetTop]");
+  assert.deepEqual(page, [0, 0, 1, 0], "the page itself does not move");
+  return [before, await browser.value("pliant.view()")];
+}
+const [still, turned] = await touched([[200, 500]], [[300, 420]]);
+const swung = Math.hypot(...turned.eye.map((x, axis) => x - still.eye[axis])) / away(still);
+assert.ok(swung > 0.2 && Math.abs(away(turned) / away(still) - 1) < 0.01, `a finger moves the camera by ${swung}`);
+const [, near] = await touched([[180, 450], [210, 450]], [[100, 450], [290, 450]]);
+told.pinch = away(near) / away(turned);
+assert.ok(told.pinch < 0.7, `two fingers come nearer by ${told.pinch}`);
+
 told.wrong = await browser.value("pliant.numbers.wrong");
 assert.equal(told.wrong, 0, await browser.value("document.getElementById('status').textContent"));
 assert.ok(told.moved > 0.02, `the body moves by ${told.moved} of its size`);
@@ -202,6 +262,8 @@ async function goesOn(what) {
 // The line is cut for 10 s: the relay stands still.
 relay.kill("SIGSTOP");
 await sleep(10_000);
+const silent = await browser.value("document.getElementById('status').textContent");
+assert.match(silent, /, nothing new for (8|9|10) s/);
 relay.kill("SIGCONT");
 told.afterCut = await goesOn("frames after a cut line");
 
@@ -215,6 +277,9 @@ await sleep(1000);
 ({ host, link } = startHost());
 await link;
 told.afterHost = await goesOn("frames after another host");
+// Whoever has moved the camera keeps it.
+const kept = await browser.value("pliant.view()");
+assert.deepEqual([kept.eye, kept.target].flat().map((x) => x.toFixed(3)), [near.eye, near.target].flat().map((x) => x.toFixed(3)));
 
 host.kill("SIGTERM");
 await until(browser, "the page without a host", async () =>

@@ -13,8 +13,6 @@ import { Stage } from "./scene";
 import { Notes, Session, type View } from "./session";
 
 const byId = <T extends HTMLElement>(id: string) => document.getElementById(id) as T;
-const stage = new Stage(byId<HTMLCanvasElement>("scene"));
-const plot = new Plot(byId<HTMLCanvasElement>("plot"));
 const status = byId("status");
 const title = byId("title");
 
@@ -22,6 +20,19 @@ function say(text: string): void {
   // Names and errors come from outside: they are text and never markup.
   status.textContent = text;
 }
+
+/** Without a stage nothing else is begun: no relay is asked for what is not shown. */
+function staged(): Stage {
+  try {
+    return new Stage(byId<HTMLCanvasElement>("scene"));
+  } catch (error) {
+    say("This browser cannot draw the session: it has no WebGL 2, or WebGL is switched off.");
+    throw error;
+  }
+}
+
+const stage = staged();
+const plot = new Plot(byId<HTMLCanvasElement>("plot"));
 
 const view: View = {
   scene: stage.scene,
@@ -78,6 +89,18 @@ const hooks = {
     }
     return { rms: Math.sqrt(sum / (shape.length / 3)), most, moved };
   },
+  /** A body's surface: corners of its triangles, the shape at a decoded tick, and where it is. */
+  surface: (body: number, tick: number) => {
+    const one = found(body, tick);
+    if (!one) return undefined;
+    const { model, body: entry } = one.watched;
+    const shape = shapeOf(model.surface, one.state.q, entry.warps);
+    const { position, orientation, scale } = entry;
+    return { triangles: [...model.surface.triangles], shape: [...shape], position, orientation, scale };
+  },
+  /** What the graphics card draws of the bodies alone, and from where. */
+  drawn: () => ({ ...stage.pixels(), ...stage.view() }),
+  view: () => stage.view(),
   /** Draws one decoded tick and stays there. */
   freeze: (tick: number) => {
     notes.frozen = tick;

@@ -3,7 +3,8 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { type Catalog, type CatalogBody, type Hand, type State, type Surface, WrongData } from "./format";
+import type { Camera, Catalog, CatalogBody, Hand, State, Surface } from "./format";
+import { WrongData } from "./format";
 import { keyOf } from "./playout";
 
 const VERTEX = /* glsl */ `
@@ -191,25 +192,81 @@ export function colorOf(user: number): THREE.Color {
   return new THREE.Color().setHSL(((200 + 137.50776 * user) % 360) / 360, 0.7, 0.55);
 }
 
+/** Angle of view in the smaller of the picture's two directions, where the host gives none, rad. */
+const FIELD_OF_VIEW = Math.PI / 4;
+/** Room around the bodies, as a share of their distance: they move out of their bounds at rest. */
+const ROOM = 1.1;
+
+/** The camera, and from where it looks until somebody moves it. */
+export class Eye {
+  readonly camera = new THREE.PerspectiveCamera(45, 1, 0.001, 1000);
+  readonly target = new THREE.Vector3();
+  /** Somebody has moved the camera: it is theirs from then on. */
+  touched = false;
+  /** Length of the diagonal of all bodies, m. */
+  size = 1;
+  #fieldOfView = FIELD_OF_VIEW;
+
+  constructor() {
+    this.camera.position.set(0.3, 0.25, 0.5);
+  }
+
+  /**
+   * Takes over the size of the picture. The angle of view is that of its smaller side, so what is
+   * seen on a wide screen is seen on a phone, too, however it is turned.
+   */
+  resize(wide: number, high: number): void {
+    const { camera } = this;
+    // A picture without a size is one that is not seen.
+    camera.aspect = wide > 0 && high > 0 ? wide / high : 1;
+    const half = Math.tan(this.#fieldOfView / 2) / Math.min(1, camera.aspect);
+    camera.fov = (2 * Math.atan(half) * 180) / Math.PI;
+    camera.updateProjectionMatrix();
+  }
+
+  /** Looks from a camera of the host, or so that all bodies are in the picture. */
+  frame(bounds: THREE.Box3, view: Camera | undefined): void {
+    if (bounds.isEmpty()) return;
+    this.size = Math.max(bounds.getSize(new THREE.Vector3()).length(), 1e-6);
+    this.camera.near = this.size / 200;
+    this.camera.far = this.size * 200;
+    if (!this.touched) {
+      this.#fieldOfView = view?.fieldOfView ?? FIELD_OF_VIEW;
+      if (view) {
+        this.camera.position.set(...view.eye);
+        this.target.set(...view.at);
+      } else {
+        // The ball around all bodies touches the edges of the picture, but for the room.
+        bounds.getCenter(this.target);
+        const away = (ROOM * this.size) / 2 / Math.sin(FIELD_OF_VIEW / 2);
+        const from = new THREE.Vector3(0.5, 0.4, 1).setLength(away);
+        this.camera.position.copy(this.target).add(from);
+      }
+      this.camera.lookAt(this.target);
+    }
+    this.resize(this.camera.aspect, 1);
+  }
+}
+
 /** The scene with its camera. */
 export class Stage {
   readonly renderer: THREE.WebGLRenderer;
   readonly scene = new THREE.Scene();
-  readonly camera = new THREE.PerspectiveCamera(45, 1, 0.001, 1000);
+  readonly eye = new Eye();
   readonly controls: OrbitControls;
   #hands = new Map<string, { ball: THREE.Mesh; arrow: THREE.ArrowHelper }>();
   #ball = new THREE.SphereGeometry(1, 20, 14);
-  #framed = false;
-  #size = 1;
 
   constructor(canvas: HTMLCanvasElement) {
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
-    this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
     this.scene.background = new THREE.Color(0x16181d);
     // One finger turns, two move and zoom.
-    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls = new OrbitControls(this.eye.camera, canvas);
+    this.controls.target = this.eye.target;
     this.controls.enableDamping = true;
-    this.camera.position.set(0.3, 0.25, 0.5);
+    this.controls.addEventListener("start", () => {
+      this.eye.touched = true;
+    });
   }
 
   get largestTexture(): number {
@@ -218,29 +275,13 @@ export class Stage {
 
   /** Looks from the catalog's first camera, or so that all bodies are in the picture. */
   frame(catalog: Catalog, drawn: Iterable<Drawn>): void {
-    if (this.#framed) return;
     const bounds = new THREE.Box3();
     for (const one of drawn) {
       one.mesh.geometry.computeBoundingBox();
       one.mesh.updateWorldMatrix(true, false);
       bounds.union(one.mesh.geometry.boundingBox!.clone().applyMatrix4(one.mesh.matrixWorld));
     }
-    if (bounds.isEmpty()) return;
-    this.#framed = true;
-    this.#size = bounds.getSize(new THREE.Vector3()).length();
-    this.camera.near = this.#size / 200;
-    this.camera.far = this.#size * 200;
-    const view = catalog.cameras[0];
-    if (view) {
-      this.camera.fov = (view.fieldOfView * 180) / Math.PI;
-      this.camera.position.set(...view.eye);
-      this.controls.target.set(...view.at);
-    } else {
-      const middle = bounds.getCenter(new THREE.Vector3());
-      this.controls.target.copy(middle);
-      this.camera.position.copy(middle).add(new THREE.Vector3(0.5, 0.4, 1).multiplyScalar(1.1 * this.#size));
-    }
-    this.camera.updateProjectionMatrix();
+    this.eye.frame(bounds, catalog.cameras[0]);
     this.controls.update();
   }
 
@@ -260,15 +301,15 @@ export class Stage {
         this.scene.add(ball, arrow);
       }
       shown.ball.position.set(...hand.target);
-      shown.ball.scale.setScalar(0.015 * this.#size);
+      shown.ball.scale.setScalar(0.015 * this.eye.size);
       const force = new THREE.Vector3(...hand.reaction);
       const size = force.length();
       shown.arrow.visible = size > 0;
       if (size > 0) {
-        const length = (0.33 * this.#size * size) / Math.max(strongest, size);
+        const length = (0.33 * this.eye.size * size) / Math.max(strongest, size);
         shown.arrow.position.copy(shown.ball.position);
         shown.arrow.setDirection(force.divideScalar(size));
-        shown.arrow.setLength(length, Math.min(0.05 * this.#size, 0.3 * length), 0.02 * this.#size);
+        shown.arrow.setLength(length, Math.min(0.05 * this.eye.size, 0.3 * length), 0.02 * this.eye.size);
       }
     }
     for (const [key, { ball, arrow }] of this.#hands) {
@@ -283,13 +324,49 @@ export class Stage {
   draw(): void {
     const canvas = this.renderer.domElement;
     const [wide, high] = [canvas.clientWidth, canvas.clientHeight];
-    const ratio = this.renderer.getPixelRatio();
+    // A window may go to another screen, and a page may be zoomed.
+    const ratio = Math.min(2, devicePixelRatio);
+    if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
     if (canvas.width !== Math.floor(wide * ratio) || canvas.height !== Math.floor(high * ratio)) {
       this.renderer.setSize(wide, high, false);
-      this.camera.aspect = wide / Math.max(1, high);
-      this.camera.updateProjectionMatrix();
+      this.eye.resize(wide, high);
     }
     this.controls.update();
-    this.renderer.render(this.scene, this.camera);
+    this.renderer.render(this.scene, this.eye.camera);
+  }
+  /** For measurements: where the camera is, at what it looks, and its vertical angle, rad. */
+  view() {
+    const { camera, target } = this.eye;
+    return {
+      eye: camera.position.toArray(),
+      turned: camera.quaternion.toArray(),
+      target: target.toArray(),
+      fieldOfView: (camera.fov * Math.PI) / 180,
+    };
+  }
+
+  /**
+   * For measurements: draws the bodies without the hands, and reads which pixels are not those of
+   * the background. Rows from below, as lengths of runs that begin with the background.
+   */
+  pixels() {
+    const hands = [...this.#hands.values()].flatMap(({ ball, arrow }) => [ball, arrow]);
+    for (const one of hands) one.removeFromParent();
+    this.draw();
+    const gl = this.renderer.getContext();
+    const [wide, high] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    const read = new Uint8Array(4 * wide * high);
+    // In the same task as the drawing: the picture is gone when it has been shown.
+    gl.readPixels(0, 0, wide, high, gl.RGBA, gl.UNSIGNED_BYTE, read);
+    if (hands.length > 0) this.scene.add(...hands);
+    const runs = [0];
+    let inside = false;
+    for (let at = 0; at < read.length; at += 4) {
+      const off = [0x16, 0x18, 0x1d].some((color, k) => Math.abs(read[at + k]! - color) > 3);
+      if (off !== inside) runs.push(0);
+      inside = off;
+      runs[runs.length - 1]!++;
+    }
+    return { wide, high, runs };
   }
 }

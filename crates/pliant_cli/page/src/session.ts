@@ -37,6 +37,8 @@ const LONGEST_PAUSE = 4000;
 const LAST_GROUPS = 2000;
 /** How long a surface may pause on its way before it is asked for anew, ms. */
 const LONGEST_SILENCE = 30_000;
+/** How long the view waits for further bodies of the catalog after the first one, ms. */
+const FRAME_PAUSE = 1000;
 /** From which age on the newest picture's age is told, ms. */
 const OLD = 2000;
 /** Most messages that are kept for measurements. */
@@ -49,6 +51,7 @@ export interface View {
   readonly scene: Pick<Scene, "add" | "remove">;
   /** Most texels of a texture in each direction. */
   readonly largestTexture: number;
+  /** Looks at all bodies, as far as the camera is not the watcher's. */
   frame(catalog: Catalog, drawn: Drawn[]): void;
   showHands(hands: Hand[]): void;
   /** Hands and numbers have arrived. */
@@ -142,6 +145,8 @@ export class Session {
   handsHeard = 0;
   handsPlayout = new HandsPlayout();
   ended = false;
+  /** When the first body of the session was seen, and whether the view has waited for the others. */
+  #framed: { first: number; all: boolean } | undefined;
   #over: () => void = () => {};
   /** Settles when the session ends. */
   #end = new Promise<void>((done) => {
@@ -221,6 +226,7 @@ export class Session {
     if (other) {
       this.clock = new TickClock(catalog.step);
       this.handsPlayout = new HandsPlayout();
+      this.#framed = undefined;
     }
     this.catalog = catalog;
     this.#view.title(catalog.name);
@@ -419,10 +425,7 @@ export class Session {
       const pair = tick === undefined ? undefined : playout.at(tick);
       if (pair) drawn.show(...pair);
     }
-    this.#view.frame(
-      catalog,
-      [...this.bodies.values()].map((watched) => watched.drawn),
-    );
+    this.#frame(catalog, now);
     // A host has one rate for hands and all bodies.
     const tick = due(Math.max(1, ...catalog.bodies.map((body) => body.every)));
     this.#view.showHands(tick === undefined ? [] : this.handsPlayout.at(tick));
@@ -433,6 +436,20 @@ export class Session {
       const bodies = this.bodies.size === 1 ? "1 body" : `${this.bodies.size} bodies`;
       this.#view.say(`${people}${bodies}${this.#age(now)}, ${(numbers.bytes / 1024).toFixed(0)} KiB${wrong}`);
     }
+  }
+
+  /** Looks at the first body at once, and once more when the others are there, or late. */
+  #frame(catalog: Catalog, now: number): void {
+    if (this.bodies.size === 0 || this.#framed?.all) return;
+    const first = this.#framed?.first ?? now;
+    const all = this.bodies.size >= catalog.bodies.length || now - first > FRAME_PAUSE;
+    if (!this.#framed || all) {
+      this.#view.frame(
+        catalog,
+        [...this.bodies.values()].map((watched) => watched.drawn),
+      );
+    }
+    this.#framed = { first, all };
   }
 
   /**

@@ -316,3 +316,30 @@ played("hands are shown at the tick that the bodies are shown at", async (host) 
   assert.equal(at(105.9)[5], undefined, "nor a moment before it");
   assert.equal(at(106.1)[5].target[0], 106);
 });
+
+played("the view waits for the bodies that the catalog names, and looks anew at another session", async (host) => {
+  const second = { ...BODY, id: 2 };
+  host.answer = (name, track) => {
+    if (name.startsWith("surface/")) track.writeFrame({ payload: SURFACE, timestamp: Time.Timestamp.now() });
+  };
+  await host.write("catalog", catalogOf([BODY, second]));
+  await host.write("body/1", frameOf(100));
+  await until("a body", () => host.session.bodies.size === 1);
+  for (let k = 0; k < 3; k++) host.status();
+  assert.deepEqual(host.framed, [1], "something is seen at once");
+  await host.write("body/2", frameOf(100));
+  await until("both", () => host.session.bodies.size === 2);
+  for (let k = 0; k < 3; k++) host.status(10 * k);
+  assert.deepEqual(host.framed, [1, 2]);
+  // A body that comes later moves no camera.
+  await host.write("catalog", catalogOf([BODY, second, { ...BODY, id: 3 }]));
+  await host.write("body/3", frameOf(102));
+  await until("all three", () => host.session.bodies.size === 3);
+  host.status(5000);
+  assert.deepEqual(host.framed, [1, 2]);
+  // Another session; of its two bodies one never comes.
+  await host.write("catalog", catalogOf([BODY, { ...second, id: 4 }], 2));
+  await until("the other session", () => host.session.catalog.session === 2n && host.session.bodies.size === 1);
+  for (const after of [0, 500, 1100, 1200]) host.status(after);
+  assert.deepEqual(host.framed, [1, 2, 1, 1]);
+});

@@ -1,0 +1,74 @@
+// From where the page looks: bodies are in the picture of any screen, and the camera is the watcher's
+// once they have moved it.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { Box3, Vector3 } from "three";
+import { Eye } from "../node_modules/.watch-test/scene.mjs";
+
+/** The corners of a box, as shares of the picture from its middle to its edge. */
+function seen(eye, bounds) {
+  eye.camera.updateMatrixWorld();
+  let [across, up] = [0, 0];
+  for (let k = 0; k < 8; k++) {
+    const corner = new Vector3(...["x", "y", "z"].map((axis, bit) => (k & (1 << bit) ? bounds.max : bounds.min)[axis]));
+    const { x, y, z } = corner.project(eye.camera);
+    assert.ok(z > -1 && z < 1, "between the nearest and the farthest");
+    [across, up] = [Math.max(across, Math.abs(x)), Math.max(up, Math.abs(y))];
+  }
+  return [across, up];
+}
+
+const boxes = [
+  ["a cube", new Box3(new Vector3(-1, -1, -1), new Vector3(1, 1, 1))],
+  ["a bar", new Box3(new Vector3(5, 0, 0), new Vector3(6, 0.1, 0.1))],
+  ["a tower", new Box3(new Vector3(0, 0, 0), new Vector3(1e-3, 0.02, 1e-3))],
+];
+const screens = [
+  [390, 844],
+  [844, 390],
+  [1280, 720],
+  [700, 700],
+];
+
+test("all bodies are in the picture of any screen, and large enough", () => {
+  for (const [name, bounds] of boxes) {
+    for (const [wide, high] of screens) {
+      // A phone may be turned after the view was chosen, or before.
+      for (const earlier of [true, false]) {
+        const eye = new Eye();
+        if (earlier) eye.resize(wide, high);
+        eye.frame(bounds, undefined);
+        eye.resize(wide, high);
+        const [across, up] = seen(eye, bounds);
+        const where = `${name} at ${wide} by ${high}: ${across} by ${up}`;
+        assert.ok(across < 0.95 && up < 0.95, where);
+        assert.ok(Math.max(across * Math.max(1, wide / high), up * Math.max(1, high / wide)) > 0.5, where);
+      }
+    }
+  }
+});
+
+test("a camera of the host has its angle in the smaller direction", () => {
+  const eye = new Eye();
+  const view = { eye: [0, 0, 2], at: [0, 0, 0], fieldOfView: 1 };
+  eye.resize(1280, 720);
+  eye.frame(boxes[0][1], view);
+  assert.deepEqual(eye.camera.position.toArray(), [0, 0, 2]);
+  assert.ok(Math.abs((eye.camera.fov * Math.PI) / 180 - 1) < 1e-9);
+  eye.resize(390, 844);
+  const across = 2 * Math.atan((Math.tan((eye.camera.fov * Math.PI) / 360) * 390) / 844);
+  assert.ok(Math.abs(across - 1) < 1e-9);
+});
+
+test("the camera stays where somebody has moved it", () => {
+  const eye = new Eye();
+  eye.resize(390, 844);
+  eye.frame(boxes[0][1], undefined);
+  eye.camera.position.set(7, 7, 7);
+  eye.touched = true;
+  eye.frame(boxes[1][1], { eye: [0, 0, 2], at: [0, 0, 0], fieldOfView: 1 });
+  assert.deepEqual(eye.camera.position.toArray(), [7, 7, 7]);
+  const smaller = 2 * Math.atan((Math.tan((eye.camera.fov * Math.PI) / 360) * 390) / 844);
+  assert.ok(Math.abs(smaller - Math.PI / 4) < 1e-9, "its angle stays, too");
+});
