@@ -236,7 +236,7 @@ told.pinch = away(near) / away(turned);
 assert.ok(told.pinch < 0.7, `two fingers come nearer by ${told.pinch}`);
 
 told.wrong = await browser.value("pliant.numbers.wrong");
-assert.equal(told.wrong, 0, await browser.value("document.getElementById('status').textContent"));
+assert.equal(told.wrong, 0, await browser.value(line));
 assert.ok(told.moved > 0.02, `the body moves by ${told.moved} of its size`);
 assert.ok(told.rms < 1e-4 && told.largest < 1e-3, JSON.stringify(told));
 
@@ -261,9 +261,11 @@ async function goesOn(what) {
 
 // The line is cut for 10 s: the relay stands still.
 relay.kill("SIGSTOP");
-await sleep(10_000);
-const silent = await browser.value("document.getElementById('status').textContent");
-assert.match(silent, /, nothing new for (8|9|10) s/);
+const cut = performance.now();
+// Until Chromium counts the relay as lost, the page says that what is seen is old.
+await until(browser, "the age of an old picture", async () => / nothing new for [2-9] s/.test(await browser.value(line)));
+told.silence = (performance.now() - cut) / 1000;
+await sleep(10_000 - (performance.now() - cut));
 relay.kill("SIGCONT");
 told.afterCut = await goesOn("frames after a cut line");
 
@@ -277,13 +279,14 @@ await sleep(1000);
 ({ host, link } = startHost());
 await link;
 told.afterHost = await goesOn("frames after another host");
-// Whoever has moved the camera keeps it.
+// Whoever has moved the camera keeps it, but for what it still glided.
 const kept = await browser.value("pliant.view()");
-assert.deepEqual([kept.eye, kept.target].flat().map((x) => x.toFixed(3)), [near.eye, near.target].flat().map((x) => x.toFixed(3)));
+const glided = Math.hypot(...kept.eye.map((x, axis) => x - near.eye[axis])) / away(near);
+assert.ok(glided < 0.2, `the camera is elsewhere by ${glided} of its distance`);
 
 host.kill("SIGTERM");
 await until(browser, "the page without a host", async () =>
-  (await browser.value("document.getElementById('status').textContent")).includes("waiting for the host"),
+  (await browser.value(line)).includes("waiting for the host"),
 );
 assert.ok(asked.host >= 3 && asked.watcher >= 2 && asked.refused === 0, JSON.stringify(asked));
 
