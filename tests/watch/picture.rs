@@ -56,8 +56,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     app.cleanup();
 
     let world = app.world_mut();
-    let mut canvas =
-        Image::new_target_texture(width.parse()?, height.parse()?, TextureFormat::Rgba8UnormSrgb, None);
+    let (width, height) = (width.parse::<u32>()?, height.parse::<u32>()?);
+    let mut canvas = Image::new_target_texture(width, height, TextureFormat::Rgba8UnormSrgb, None);
     canvas.texture_descriptor.usage |= TextureUsages::COPY_SRC;
     let canvas = world.resource_mut::<Assets<Image>>().add(canvas);
     let positions = model.surface().positions().to_vec();
@@ -67,9 +67,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     let skin = StandardMaterial { perceptual_roughness: 0.6, ..Color::srgb(0.8, 0.8, 0.82).into() };
     let skin = world.resource_mut::<Assets<StandardMaterial>>().add(skin);
     world.spawn((ModalBody::new(asset), MeshMaterial3d(skin)));
-    // As the page looks where the catalog has no camera (`Stage.frame` in page/src/scene.ts).
+    // As the page looks where the catalog has no camera (`Eye` in page/src/scene.ts): the angle is
+    // that of the smaller side.
     let (middle, size) = (Vec3::from(bounds.center), 2.0 * Vec3::from(bounds.half_extents).length());
-    let eye = middle + Vec3::new(0.5, 0.4, 1.0) * 1.1 * size;
+    let half = 22.5f32.to_radians();
+    let eye = middle + Vec3::new(0.5, 0.4, 1.0).normalize() * 1.1 * size / 2.0 / half.sin();
+    let fov = 2.0 * (half.tan() / (width as f32 / height as f32).min(1.0)).atan();
     let place = Transform::from_translation(eye).looking_at(middle, Vec3::Y);
     let key = place.rotation * Vec3::new(0.4, 0.8, 0.6);
     world.spawn((
@@ -78,7 +81,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     ));
     world.spawn((
         Camera3d::default(),
-        Projection::from(PerspectiveProjection { fov: 45f32.to_radians(), near: size / 200.0, ..default() }),
+        Projection::from(PerspectiveProjection { fov, near: size / 200.0, ..default() }),
         RenderTarget::from(canvas.clone()),
         place,
         AmbientLight { brightness: 600.0, ..default() },

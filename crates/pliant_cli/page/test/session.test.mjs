@@ -106,13 +106,13 @@ class Host {
 
   constructor() {
     const scene = { add: () => {}, remove: () => {} };
-    const view = {
+    this.view = {
       ...{ scene, largestTexture: 4096, title: () => {}, heard: () => {} },
       say: (text) => this.said.push(text),
       frame: (_, drawn) => this.framed.push([...drawn].length),
       showHands: (hands) => (this.hands = hands),
     };
-    this.session = new Session(this.#broadcast.consume(), view, this.notes);
+    this.session = new Session(this.#broadcast.consume(), this.view, this.notes);
     void this.#serve();
     this.session.start();
   }
@@ -265,6 +265,48 @@ played("a surface of a body that has gone is asked for no longer", async (host) 
   await sleep(2500);
   assert.equal(host.times(surface).length, 2);
   assert.equal(host.session.models.size, 0);
+});
+
+played("a surface that stands still is asked for anew", async (host) => {
+  const surface = `surface/${"07".repeat(32)}`;
+  let tries = 0;
+  host.answer = (name, track) => {
+    if (name !== surface) return;
+    const group = track.appendGroup();
+    const payload = ++tries === 1 ? SURFACE.slice(0, 50) : SURFACE;
+    group.writeFrame({ payload, timestamp: Time.Timestamp.now() });
+  };
+  await host.write("catalog", catalogOf([BODY]));
+  await until("a part of it", () => host.said.some((text) => text.startsWith("model: ")));
+  await sleep(1500);
+  assert.equal(tries, 1, "it may pause");
+  skew = 31_000;
+  await host.write("body/1", frameOf(100));
+  await until("the body", () => host.session.bodies.size === 1);
+  assert.equal(tries, 2);
+});
+
+played("a model that the graphics card cannot hold is told of, and not asked for again", async (host) => {
+  const surface = `surface/${"07".repeat(32)}`;
+  host.view.largestTexture = 1;
+  host.answer = (name, track) => {
+    if (name === surface) track.writeFrame({ payload: SURFACE, timestamp: Time.Timestamp.now() });
+  };
+  await host.write("catalog", catalogOf([BODY]));
+  await until("a word", () => host.said.some((text) => text.includes("too large for this graphics card")));
+  await sleep(1500);
+  assert.equal(host.times(surface).length, 1);
+});
+
+played("a body's track that ends is asked for again, whatever hangs in it", async (host) => {
+  await host.seen([BODY]);
+  const track = host.tracks.get("body/1");
+  track.appendGroup().writeFrame({ payload: frameOf(102), timestamp: Time.Timestamp.now() });
+  await sleep(100);
+  track.close();
+  await until("the track", () => host.times("body/1").length === 2);
+  await host.write("body/1", frameOf(104));
+  await until("the frame", () => host.session.bodies.get(1).playout.newest.tick === 104);
 });
 
 played("the page says how old the newest picture is, unless the bodies rest", async (host) => {
