@@ -228,11 +228,14 @@ async function touched(from, to) {
   assert.deepEqual(page, [0, 0, 1, 0], "the page itself does not move");
   return [before, await browser.value("pliant.view()")];
 }
+const [, tapped] = await touched([[200, 500]], [[200, 500]]);
+assert.ok(!tapped.touched, "a touch that moves nothing leaves the view to the page");
 const [still, turned] = await touched([[200, 500]], [[300, 420]]);
 const swung = Math.hypot(...turned.eye.map((x, axis) => x - still.eye[axis])) / away(still);
 assert.ok(swung > 0.2 && Math.abs(away(turned) / away(still) - 1) < 0.01, `a finger moves the camera by ${swung}`);
 const [, near] = await touched([[180, 450], [210, 450]], [[100, 450], [290, 450]]);
 told.pinch = away(near) / away(turned);
+assert.ok(near.touched);
 assert.ok(told.pinch < 0.7, `two fingers come nearer by ${told.pinch}`);
 
 told.wrong = await browser.value("pliant.numbers.wrong");

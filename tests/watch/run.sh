@@ -1,8 +1,9 @@
 #!/bin/sh
 # A session in a browser, for real: moq-relay, a dedicated_server that publishes, the page that
 # `pliant watch-page` writes, and headless Chromium. The page computes how far its shapes are from
-# the host's truth, and says what it is sent when that is damaged; relay and host are killed and
-# started again, and the line is cut.
+# the host's truth, and its pixels are compared with what must be seen of that truth, in a window
+# and on a phone's screen, which is touched with one finger and with two. Relay and host are killed
+# and started again, and the line is cut.
 #
 #   tests/watch/run.sh
 #

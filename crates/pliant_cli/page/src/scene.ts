@@ -264,9 +264,6 @@ export class Stage {
     this.controls = new OrbitControls(this.eye.camera, canvas);
     this.controls.target = this.eye.target;
     this.controls.enableDamping = true;
-    this.controls.addEventListener("start", () => {
-      this.eye.touched = true;
-    });
   }
 
   get largestTexture(): number {
@@ -331,13 +328,17 @@ export class Stage {
       this.renderer.setSize(wide, high, false);
       this.eye.resize(wide, high);
     }
+    const before = this.eye.camera.position.clone();
     this.controls.update();
+    // Nothing else moves the camera here; rounding moves it by less, and a touch alone does not.
+    if (before.distanceTo(this.eye.camera.position) > 1e-4 * this.eye.size) this.eye.touched = true;
     this.renderer.render(this.scene, this.eye.camera);
   }
   /** For measurements: where the camera is, at what it looks, and its vertical angle, rad. */
   view() {
-    const { camera, target } = this.eye;
+    const { camera, target, touched } = this.eye;
     return {
+      touched,
       eye: camera.position.toArray(),
       turned: camera.quaternion.toArray(),
       target: target.toArray(),

@@ -121,14 +121,20 @@ function alike(a: CatalogBody, b: CatalogBody): boolean {
   return same && surfaceOf(a) === surfaceOf(b);
 }
 
-/** Waits, and returns earlier if `gone` settles. The timer does not stay. */
-async function pause(ms: number, gone: Promise<unknown>): Promise<void> {
-  let timer: ReturnType<typeof setTimeout> | undefined;
-  const over = new Promise((done) => {
-    timer = setTimeout(done, ms);
+/** Waits, but not beyond the end of what waits, nor until `earlier` if that is given. */
+async function pause(ms: number, end: AbortSignal, earlier?: Promise<unknown>): Promise<void> {
+  if (end.aborted) return;
+  await new Promise<void>((done) => {
+    // Nothing of it stays: a session may wait a million times.
+    const over = () => {
+      clearTimeout(timer);
+      end.removeEventListener("abort", over);
+      done();
+    };
+    const timer = setTimeout(over, ms);
+    end.addEventListener("abort", over);
+    void earlier?.then(over);
   });
-  await Promise.race([over, gone]);
-  clearTimeout(timer);
 }
 
 /** One broadcast, from its catalog to its end. */
@@ -147,11 +153,8 @@ export class Session {
   ended = false;
   /** When the first body of the session was seen, and whether the view has waited for the others. */
   #framed: { first: number; all: boolean } | undefined;
-  #over: () => void = () => {};
-  /** Settles when the session ends. */
-  #end = new Promise<void>((done) => {
-    this.#over = done;
-  });
+  /** What ends each track that is followed. */
+  #tracks = new Set<AbortController>();
   #view: View;
   #notes: Notes;
 
@@ -179,7 +182,12 @@ export class Session {
    */
   #follow(name: string, priority: number, read: (group: Group.Consumer) => Promise<void>): () => void {
     let track: Track.Subscriber | undefined;
-    let over = false;
+    const end = new AbortController();
+    this.#tracks.add(end);
+    end.signal.addEventListener("abort", () => {
+      this.#tracks.delete(end);
+      track?.close();
+    });
     const one = async (group: Group.Consumer) => {
       try {
         await read(group);
@@ -190,12 +198,12 @@ export class Session {
       }
     };
     const run = async () => {
-      while (!over && !this.ended) {
+      while (!end.signal.aborted) {
         const open: { group: Group.Consumer; read: Promise<void> }[] = [];
         try {
           track = this.broadcast.track(name).subscribe({ priority, latencyMax: 300 });
           for (let group = await track.nextGroup(); group; group = await track.nextGroup()) {
-            if (over || this.ended) {
+            if (end.signal.aborted) {
               group.close();
               break;
             }
@@ -204,21 +212,18 @@ export class Session {
             if (open.length > 2) open.shift()?.group.close();
           }
           // A track may end while its last groups are on the way.
-          await pause(LAST_GROUPS, Promise.race([this.#end, Promise.all(open.map((one) => one.read))]));
+          await pause(LAST_GROUPS, end.signal, Promise.all(open.map((one) => one.read)));
         } catch (error) {
           this.#told(error);
         }
         for (const { group } of open) group.close();
         track?.close();
         // A track that ended may come again, but not at once.
-        await pause(RETRY_PAUSE, this.#end);
+        await pause(RETRY_PAUSE, end.signal);
       }
     };
     void run();
-    return () => {
-      over = true;
-      track?.close();
-    };
+    return () => end.abort();
   }
 
   #read(catalog: Catalog): void {
@@ -288,29 +293,24 @@ export class Session {
     const key = surfaceOf(body);
     const known = this.models.get(key);
     if (known) return known.ready;
-    let gone = false;
-    let stop = () => {};
+    const gone = new AbortController();
     let made: Model | undefined;
-    const over = new Promise<void>((done) => {
-      stop = done;
-    });
     const end = () => {
-      gone = true;
-      stop();
+      gone.abort();
       made?.dispose();
     };
     const fetch = async (done: (model: Model) => void) => {
       // A host writes a surface once for each that asks, so that whoever has not got it asks again.
-      for (let wait = RETRY_PAUSE; !gone && !this.ended; wait = Math.min(2 * wait, LONGEST_PAUSE)) {
+      for (let wait = RETRY_PAUSE; !gone.signal.aborted; wait = Math.min(2 * wait, LONGEST_PAUSE)) {
         let surface: Surface | undefined;
         try {
-          surface = await this.#surface(body, Promise.race([over, this.#end]));
+          surface = await this.#surface(body, gone.signal);
         } catch (error) {
           this.#told(error);
         }
-        if (gone || this.ended) return;
+        if (gone.signal.aborted) return;
         if (!surface) {
-          await pause(wait, Promise.race([over, this.#end]));
+          await pause(wait, gone.signal);
           continue;
         }
         try {
@@ -329,7 +329,7 @@ export class Session {
   }
 
   /** Asks for a surface, and reads it. Returns nothing when it was cut off. */
-  async #surface(body: CatalogBody, gone: Promise<unknown>): Promise<Surface | undefined> {
+  async #surface(body: CatalogBody, gone: AbortSignal): Promise<Surface | undefined> {
     const assembler = new Assembler(body.surfaceBytes);
     let bytes = 0;
     for (const model of this.models.values()) bytes += model.bytes;
@@ -345,7 +345,7 @@ export class Session {
     const silence = setInterval(() => {
       if (performance.now() - heard > LONGEST_SILENCE) close();
     }, 1000);
-    void gone.then(close);
+    gone.addEventListener("abort", close);
     try {
       group = await track.nextGroup();
       if (group) this.#notes.numbers.groups++;
@@ -361,6 +361,7 @@ export class Session {
       return undefined;
     } finally {
       clearInterval(silence);
+      gone.removeEventListener("abort", close);
       close();
     }
   }
@@ -476,7 +477,7 @@ export class Session {
 
   end(): void {
     this.ended = true;
-    this.#over();
+    for (const track of [...this.#tracks]) track.abort();
     for (const { end } of this.wanted.values()) end();
     for (const id of [...this.bodies.keys()]) this.#remove(id);
     for (const model of this.models.values()) model.end();
