@@ -29,8 +29,8 @@ const limits = { timeout: 30_000, killSignal: "SIGKILL" };
 execFileSync(join(BIN, "pliant"), ["watch-page", site], limits);
 const pageAddress = await serve(site);
 
-// A certificate that lives longer than a relay: browsers take those of two weeks at most by their hash.
-// In a folder of its own: a relay reads it anew after each change beside it.
+// A certificate that lives longer than a relay: browsers take those of two weeks at most by their
+// hash. In a folder of its own: a relay reads it anew after each change beside it.
 const tls = join(WORK, "tls");
 mkdirSync(tls);
 const [key, certificate] = [join(tls, "key.pem"), join(tls, "certificate.pem")];

@@ -7,7 +7,7 @@ function turn([x, y, z, w], [a, b, c]) {
   return [a + w * i + y * k - z * j, b + w * j + z * i - x * k, c + w * k + x * j - y * i];
 }
 
-/** Which pixels of `wide` by `high` have a surface whose vertices are at `shape`, rows from below. */
+/** Which pixels have a surface whose vertices are at `shape`, rows from below. */
 export function expected(shape, { triangles, position, orientation, scale }, view) {
   const { wide, high, eye, turned, fieldOfView } = view;
   const mask = new Uint8Array(wide * high);

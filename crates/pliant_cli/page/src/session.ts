@@ -81,8 +81,8 @@ export class Notes {
   /** Counts and names what is wrong, and returns whether it is. */
   told(error: unknown): boolean {
     const found = error instanceof Error ? error.message : String(error);
-    // A track or a group that was closed is no fault. Wrong data are counted and named, and the page
-    // goes on. The library has limits of its own for a frame and a group.
+    // A track or a group that was closed is no fault. Wrong data are counted and named, and the
+    // page goes on. The library has limits of its own for a frame and a group.
     const tooLong = found.includes("exceeds max size");
     const flood = error instanceof Group.Lagged;
     if (!(error instanceof WrongData) && !tooLong && !flood) {
@@ -109,6 +109,14 @@ export interface Watched {
 /** A body that the catalog names, and what ends its tracks. */
 interface Wanted {
   body: CatalogBody;
+  end: () => void;
+}
+
+/** A model that is there or on the way. */
+interface Fetched {
+  /** Bytes that it may take, once there is room for it. */
+  bytes: number;
+  ready: Promise<Model>;
   end: () => void;
 }
 
@@ -143,7 +151,7 @@ export class Session {
   readonly bodies = new Map<number, Watched>();
   /** Bodies whose model or frames are on the way. */
   readonly wanted = new Map<number, Wanted>();
-  readonly models = new Map<string, { bytes: number; ready: Promise<Model>; end: () => void }>();
+  readonly models = new Map<string, Fetched>();
   catalog: Catalog | undefined;
   clock = new TickClock(1 / 60);
   /** The newest hands, and when they arrived. */
@@ -151,7 +159,7 @@ export class Session {
   handsHeard = 0;
   handsPlayout = new HandsPlayout();
   ended = false;
-  /** When the first body of the session was seen, and whether the view has waited for the others. */
+  /** When the first body was seen, and whether the view has waited for the others. */
   #framed: { first: number; all: boolean } | undefined;
   /** What ends each track that is followed. */
   #tracks = new Set<AbortController>();
@@ -177,8 +185,9 @@ export class Session {
   }
 
   /**
-   * Reads a track, group by group. What is wrong ends its group; the watching goes on. A group that
-   * neither ends nor goes on is closed when the second group after it begins, so it holds up nothing.
+   * Reads a track, group by group. What is wrong ends its group; the watching goes on. A group
+   * that neither ends nor goes on is closed when the second group after it begins, so it holds up
+   * nothing.
    */
   #follow(name: string, priority: number, read: (group: Group.Consumer) => Promise<void>): () => void {
     let track: Track.Subscriber | undefined;
@@ -304,6 +313,7 @@ export class Session {
       for (let wait = RETRY_PAUSE; !gone.signal.aborted; wait = Math.min(2 * wait, LONGEST_PAUSE)) {
         let surface: Surface | undefined;
         try {
+          this.#admit(body);
           surface = await this.#surface(body, gone.signal);
         } catch (error) {
           this.#told(error);
@@ -323,17 +333,28 @@ export class Session {
         return;
       }
     };
-    const ready = new Promise<Model>((done) => void fetch(done));
-    this.models.set(key, { bytes: body.surfaceBytes, ready, end });
+    let done: (model: Model) => void = () => {};
+    const ready = new Promise<Model>((made) => {
+      done = made;
+    });
+    this.models.set(key, { bytes: 0, ready, end });
+    void fetch(done);
     return ready;
+  }
+
+  /** Whether there is room for a surface. What is refused takes no room from the others. */
+  #admit(body: CatalogBody): void {
+    const fetched = this.models.get(surfaceOf(body));
+    if (!fetched || fetched.bytes > 0) return;
+    let bytes = body.surfaceBytes;
+    for (const other of this.models.values()) bytes += other.bytes;
+    if (!(bytes <= MAX_SURFACES)) throw new WrongData("the session's models are too large");
+    fetched.bytes = body.surfaceBytes;
   }
 
   /** Asks for a surface, and reads it. Returns nothing when it was cut off. */
   async #surface(body: CatalogBody, gone: AbortSignal): Promise<Surface | undefined> {
     const assembler = new Assembler(body.surfaceBytes);
-    let bytes = 0;
-    for (const model of this.models.values()) bytes += model.bytes;
-    if (bytes > MAX_SURFACES) throw new WrongData("the session's models are too large");
     const track = this.broadcast.track(`surface/${body.model}`).subscribe({ priority: 0, latencyMax: 300 });
     let group: Group.Consumer | undefined;
     // Whoever closes what is read ends the reading. The next try begins with a line of its own.
@@ -402,7 +423,7 @@ export class Session {
     this.#sayBefore(`The session sends what this page does not take: ${this.#notes.lastWrong}`);
   }
 
-  /** Says what is under way or wrong while there is no body to see: its line says that, and more. */
+  /** Says what is under way or wrong while no body is seen: with one, its line says more. */
   #sayBefore(text: string): void {
     if (this.bodies.size === 0) this.#view.say(text);
   }

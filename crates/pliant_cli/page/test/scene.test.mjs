@@ -1,5 +1,5 @@
-// From where the page looks: bodies are in the picture of any screen, and the camera is the watcher's
-// once they have moved it.
+// From where the page looks: bodies are in the picture of any screen, and the camera is the
+// watcher's once they have moved it.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";

@@ -67,7 +67,7 @@ function catalogOf(bodies, session = 1) {
     ["u16", body.id],
     ["name", body.name],
     ["bytes", body.model],
-    ["u64", 0, SURFACE.length],
+    ["u64", 0, body.surfaceBytes ?? SURFACE.length],
     ["u16", body.modes, body.every],
     ["u8", (body.warps ? 1 : 0) + (body.free ? 2 : 0)],
     ["f32", ...body.position, ...body.orientation, body.scale],
@@ -284,6 +284,20 @@ played("a surface that stands still is asked for anew", async (host) => {
   await host.write("body/1", frameOf(100));
   await until("the body", () => host.session.bodies.size === 1);
   assert.equal(tries, 2);
+});
+
+played("a surface of any length beside it takes no other one's place", async (host) => {
+  const surface = `surface/${"07".repeat(32)}`;
+  let tries = 0;
+  host.answer = (name, track) => {
+    if (name !== surface) return;
+    if (++tries === 1) track.appendGroup().close(new Error("the stream was reset"));
+    else track.writeFrame({ payload: SURFACE, timestamp: Time.Timestamp.now() });
+  };
+  const huge = { ...BODY, id: 2, model: OTHER, surfaceBytes: 2n ** 64n - 1n };
+  await host.write("catalog", catalogOf([BODY, huge]));
+  await host.write("body/1", frameOf(100));
+  await until("the body", () => host.session.bodies.size === 1);
 });
 
 played("a model that the graphics card cannot hold is told of, and not asked for again", async (host) => {
