@@ -154,6 +154,7 @@ const printed = spawnSync(join(BIN, "examples/watch_truth"), [trace, body, ...ch
 assert.equal(printed.status, 0, `the truth: ${printed.error ?? printed.stderr}`);
 const truth = JSON.parse(printed.stdout);
 let [sum, most, moved, furthest, compared] = [0, 0, 0, chosen[0], 0];
+let [least, nearest] = [Infinity, chosen[0]];
 for (const [tick, positions] of Object.entries(truth.ticks)) {
   const off = await browser.value(`pliant.compare(${id}, ${tick}, ${JSON.stringify(positions)})`);
   assert.ok(off, `the page has no tick ${tick}`);
@@ -161,6 +162,7 @@ for (const [tick, positions] of Object.entries(truth.ticks)) {
   sum += off.rms ** 2;
   most = Math.max(most, off.most);
   if (off.moved > moved) [moved, furthest] = [off.moved, Number(tick)];
+  if (off.moved < least) [least, nearest] = [off.moved, Number(tick)];
 }
 assert.ok(compared >= 16, `${compared} ticks are in both`);
 Object.assign(told, {
@@ -192,9 +194,8 @@ async function picture(shape) {
 const bent = truth.ticks[furthest];
 const desk = await picture(bent);
 told.silhouette = desk.same;
-// The same test would see a body that is drawn at another tick.
-const others = Object.entries(truth.ticks).map(([tick, shape]) => [tick, overlap(unpacked(desk), expected(shape, surface, desk))]);
-told.silhouetteOfAnotherTick = Math.min(...others.map(([, same]) => same));
+// The same test sees that a body is drawn at another tick.
+told.silhouetteOfAnotherTick = overlap(unpacked(desk), expected(truth.ticks[nearest], surface, desk));
 assert.ok(told.silhouette > 0.98, `the picture is that of the body by ${told.silhouette}`);
 assert.ok(told.silhouetteOfAnotherTick < told.silhouette - 0.02, `${told.silhouetteOfAnotherTick}`);
 
