@@ -121,6 +121,8 @@ export class Drawn {
   #coordinates: THREE.DataTexture;
   #values: Float32Array;
   #body: CatalogBody;
+  /** Where a free body was drawn last, in its own meters. */
+  #pose: { position: THREE.Vector3; turned: THREE.Quaternion } | undefined;
 
   constructor(body: CatalogBody, model: Model) {
     this.#body = body;
@@ -155,6 +157,7 @@ export class Drawn {
     this.mesh.position.set(...body.position);
     this.mesh.quaternion.set(...body.orientation);
     this.mesh.scale.setScalar(body.scale);
+    this.#take();
     const [r, g, b, a] = body.color;
     const { material } = this.mesh;
     material.uniforms.color!.value.setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace);
@@ -174,11 +177,18 @@ export class Drawn {
     this.#coordinates.needsUpdate = true;
     if (this.#body.free && from.position && to.position && from.rotation && to.rotation) {
       const position = new THREE.Vector3(...from.position).lerp(new THREE.Vector3(...to.position), part);
-      // Poses are in the body's own meters.
-      this.mesh.position.copy(position.multiplyScalar(this.#body.scale));
       const turned = new THREE.Quaternion(...from.rotation);
-      this.mesh.quaternion.copy(turned.slerp(new THREE.Quaternion(...to.rotation), part));
+      turned.slerp(new THREE.Quaternion(...to.rotation), part);
+      this.#pose = { position, turned };
+      this.#take();
     }
+  }
+
+  /** A free body is where its frames say, and not where the catalog does. */
+  #take(): void {
+    if (!this.#pose) return;
+    this.mesh.position.copy(this.#pose.position).multiplyScalar(this.#body.scale);
+    this.mesh.quaternion.copy(this.#pose.turned);
   }
 
   dispose(): void {

@@ -4,7 +4,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { Box3, Vector3 } from "three";
-import { Eye } from "../node_modules/.watch-test/scene.mjs";
+import { Drawn, Eye, Model } from "../node_modules/.watch-test/scene.mjs";
 
 /** The corners of a box, as shares of the picture from its middle to its edge. */
 function seen(eye, bounds) {
@@ -71,4 +71,18 @@ test("the camera stays where somebody has moved it", () => {
   assert.deepEqual(eye.camera.position.toArray(), [7, 7, 7]);
   const smaller = 2 * Math.atan((Math.tan((eye.camera.fov * Math.PI) / 360) * 390) / 844);
   assert.ok(Math.abs(smaller - Math.PI / 4) < 1e-9, "its angle stays, too");
+});
+
+test("a free body stays at its pose when its size or color changes", () => {
+  const [numbers, none] = [Float32Array.of(0, 0, 0, 1, 0, 0, 0, 1, 0), new Float32Array(9)];
+  const triangle = { positions: numbers, triangles: Uint32Array.of(0, 1, 2) };
+  const surface = { model: "", modes: 1, places: Float32Array.of(1), ...triangle, displacement: none, rotation: none };
+  const body = { free: true, warps: false, position: [0, 0, 0], orientation: [0, 0, 0, 1], scale: 1, color: [9, 9, 9, 255] };
+  const drawn = new Drawn(body, new Model(surface, 64));
+  const state = { tick: 1, q: Float64Array.of(0), position: [1, 2, 3], rotation: [0, 1, 0, 0], resting: true };
+  drawn.show(state, state, 0);
+  drawn.place({ ...body, scale: 2 });
+  assert.deepEqual(drawn.mesh.position.toArray(), [2, 4, 6]);
+  assert.deepEqual(drawn.mesh.quaternion.toArray(), [0, 1, 0, 0]);
+  assert.equal(drawn.mesh.scale.x, 2);
 });
