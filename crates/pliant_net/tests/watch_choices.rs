@@ -247,18 +247,72 @@ fn models_that_never_come_leave_room_for_one_that_does() {
 async fn false_models(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
     let track = |name: &str| broadcast.create_track(name, None).unwrap();
     let mut catalogs = track("catalog");
-    let (bytes, now) = (model.to_bytes(), Timestamp::now);
-    let files = track(&model_track(model.hash()));
-    let mut group = files.append_group().unwrap();
-    for piece in pieces(&bytes) {
-        group.write_frame(now(), piece.to_vec()).unwrap();
+    let _files = give(track(&model_track(model.hash())), &model);
+    for k in 0..100_u8 {
+        // The track is there, and nothing ever comes in it.
+        let hash = ModelHash([k; 32]);
+        let empty = track(&model_track(hash));
+        // Small ones last, which fill what large ones leave.
+        let file_bytes = if k < 50 { 30 << 20 } else { 1 << 20 };
+        let body = CatalogBody { model: hash, file_bytes, ..entry(&model) };
+        catalogs.write_frame(Timestamp::now(), catalog(1, body)).unwrap();
+        tokio::time::sleep(Duration::from_millis(30)).await;
+        drop(empty);
     }
-    group.finish().unwrap();
-    let entry = CatalogBody {
+    catalogs.write_frame(Timestamp::now(), catalog(1, entry(&model))).unwrap();
+    swing(track(&body_track(BodyId(1))), &model).await;
+}
+
+/// A relay that goes on with another start of the host in the same broadcast shows it.
+#[test]
+fn another_session_in_the_same_broadcast_is_seen() {
+    let _alone = alone();
+    let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
+        let broadcast = origin.publish(NAME, origin::Route::default()).unwrap();
+        tokio::task::spawn_local(two_sessions(broadcast, bar()));
+    });
+    let mut watching = app(NetPlugin::default());
+    watching.add_plugins(WatchPlugin);
+    watching.world_mut().commands().watch_session(options(&relay));
+    let session = |watching: &App| {
+        let state = watching.world().resource::<WatchState>();
+        state.catalog.as_ref().map(|catalog| catalog.session)
+    };
+    for number in [1, 2] {
+        wait_for("the body of the session", || {
+            std::thread::sleep(Duration::from_millis(3));
+            watching.update();
+            let there = body_of(&mut watching);
+            must!(
+                session(&watching) == Some(number) && there.is_some(),
+                "{:?}, {there:?}",
+                session(&watching)
+            );
+            Ok(())
+        });
+    }
+}
+
+async fn two_sessions(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
+    let track = |name: &str| broadcast.create_track(name, None).unwrap();
+    let mut catalogs = track("catalog");
+    let _files = give(track(&model_track(model.hash())), &model);
+    catalogs.write_frame(Timestamp::now(), catalog(1, entry(&model))).unwrap();
+    let frames = track(&body_track(BodyId(1)));
+    let changes = async {
+        tokio::time::sleep(Duration::from_secs(3)).await;
+        catalogs.write_frame(Timestamp::now(), catalog(2, entry(&model))).unwrap();
+        std::future::pending::<()>().await;
+    };
+    tokio::join!(changes, swing(frames, &model));
+}
+
+fn entry(model: &ModalModel) -> CatalogBody {
+    CatalogBody {
         id: BodyId(1),
         name: "a bar".into(),
         model: model.hash(),
-        file_bytes: bytes.len() as u64,
+        file_bytes: model.to_bytes().len() as u64,
         surface_bytes: 0,
         modes: 4,
         every: 1,
@@ -266,31 +320,32 @@ async fn false_models(broadcast: moq_net::broadcast::Producer, model: Arc<ModalM
         free: false,
         placement: Placement::default(),
         color: [0; 4],
-    };
-    let catalog = |body: CatalogBody| {
-        Catalog { session: 1, step: 0.025, name: "lies".into(), bodies: vec![body], cameras: Vec::new() }
-            .encode()
-    };
-    for k in 0..100_u8 {
-        // The track is there, and nothing ever comes in it.
-        let hash = ModelHash([k; 32]);
-        let empty = track(&model_track(hash));
-        // Small ones last, which fill what large ones leave.
-        let file_bytes = if k < 50 { 30 << 20 } else { 1 << 20 };
-        let body = CatalogBody { model: hash, file_bytes, ..entry.clone() };
-        catalogs.write_frame(now(), catalog(body)).unwrap();
-        tokio::time::sleep(Duration::from_millis(30)).await;
-        drop(empty);
     }
-    catalogs.write_frame(now(), catalog(entry)).unwrap();
-    let mut encoder = BodyEncoder::new(&model, WatchConfig { rate: 40.0, ..WatchConfig::default() }, 0.025);
-    let encoder = encoder.as_mut().unwrap();
-    let mut body = track(&body_track(BodyId(1)));
+}
+
+fn catalog(session: u64, body: CatalogBody) -> Vec<u8> {
+    Catalog { session, step: 0.025, name: "lies".into(), bodies: vec![body], cameras: Vec::new() }.encode()
+}
+
+/// Publishes a model's file in a track, for as long as what is returned is kept.
+fn give(track: moq_net::track::Producer, model: &ModalModel) -> moq_net::track::Producer {
+    let mut group = track.append_group().unwrap();
+    for piece in pieces(&model.to_bytes()) {
+        group.write_frame(Timestamp::now(), piece.to_vec()).unwrap();
+    }
+    group.finish().unwrap();
+    track
+}
+
+/// Publishes frames of a body for ever.
+async fn swing(mut track: moq_net::track::Producer, model: &ModalModel) {
+    let config = WatchConfig { rate: 40.0, ..WatchConfig::default() };
+    let mut encoder = BodyEncoder::new(model, config, 0.025).unwrap();
     for tick in 1.. {
         let q = [0.01; 4];
         let state = TickState { tick, q: &q, v: &[], a: &[], z: &[], pose: None, grabs: &[], resting: false };
         if let Some(frame) = encoder.encode(&state).unwrap() {
-            body.write_frame(now(), frame.bytes).unwrap();
+            track.write_frame(Timestamp::now(), frame.bytes).unwrap();
         }
         tokio::time::sleep(Duration::from_millis(25)).await;
     }

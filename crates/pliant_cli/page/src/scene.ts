@@ -121,7 +121,7 @@ export class Drawn {
   #coordinates: THREE.DataTexture;
   #values: Float32Array;
   #body: CatalogBody;
-  /** Where a free body was drawn last, in its own meters. */
+  /** Where a body with poses in its frames was drawn last, in its own meters. */
   #pose: { position: THREE.Vector3; turned: THREE.Quaternion } | undefined;
 
   constructor(body: CatalogBody, model: Model) {
@@ -175,7 +175,7 @@ export class Drawn {
       data[k] = a + (b - a) * part;
     }
     this.#coordinates.needsUpdate = true;
-    if (this.#body.free && from.position && to.position && from.rotation && to.rotation) {
+    if (from.position && to.position && from.rotation && to.rotation) {
       const position = new THREE.Vector3(...from.position).lerp(new THREE.Vector3(...to.position), part);
       const turned = new THREE.Quaternion(...from.rotation);
       turned.slerp(new THREE.Quaternion(...to.rotation), part);
@@ -184,7 +184,10 @@ export class Drawn {
     }
   }
 
-  /** A free body is where its frames say, and not where the catalog does. */
+  /**
+   * A body with poses in its frames is where these say, and not where the catalog does: a free one,
+   * and an anchored one that is moved.
+   */
   #take(): void {
     if (!this.#pose) return;
     this.mesh.position.copy(this.#pose.position).multiplyScalar(this.#body.scale);

@@ -86,3 +86,17 @@ test("a free body stays at its pose when its size or color changes", () => {
   assert.deepEqual(drawn.mesh.quaternion.toArray(), [0, 1, 0, 0]);
   assert.equal(drawn.mesh.scale.x, 2);
 });
+
+test("an anchored body that is moved is where its frames say", () => {
+  const [numbers, none] = [Float32Array.of(0, 0, 0, 1, 0, 0, 0, 1, 0), new Float32Array(9)];
+  const triangle = { positions: numbers, triangles: Uint32Array.of(0, 1, 2) };
+  const surface = { model: "", modes: 1, places: Float32Array.of(1), ...triangle, displacement: none, rotation: none };
+  const body = { free: false, warps: false, position: [7, 0, 0], orientation: [0, 0, 0, 1], scale: 2, color: [9, 9, 9, 255] };
+  const drawn = new Drawn(body, new Model(surface, 64));
+  const rests = { tick: 1, q: Float64Array.of(0), resting: false };
+  drawn.show(rests, rests, 0);
+  assert.deepEqual(drawn.mesh.position.toArray(), [7, 0, 0]);
+  const [from, to] = [4, 6].map((x) => ({ ...rests, position: [x, 0, 0], rotation: [0, 0, 0, 1] }));
+  drawn.show(from, to, 0.5);
+  assert.deepEqual(drawn.mesh.position.toArray(), [10, 0, 0]);
+});

@@ -265,12 +265,20 @@ impl Scene {
     async fn follow(&self) {
         let _hands = Owned::spawn(self.clone().follow_hands());
         let mut bodies: BTreeMap<BodyId, FollowedBody> = BTreeMap::new();
+        let mut session = None;
         loop {
             if let Ok(mut track) = self.subscribe(CATALOG_TRACK, 3).await {
                 while let Ok(Some(mut group)) = track.next_group().await {
                     let Ok(Some(frame)) = group.read_frame().await else { continue };
                     match checked(&frame.payload).and_then(|bytes| decoded(Catalog::decode(bytes))) {
-                        Ok(catalog) => self.take(catalog, &mut bodies).await,
+                        Ok(catalog) => {
+                            // A relay that has lost the host may go on with another start of it.
+                            let new = Some((catalog.session, catalog.step.to_bits()));
+                            if std::mem::replace(&mut session, new) != new {
+                                bodies.clear();
+                            }
+                            self.take(catalog, &mut bodies).await;
+                        }
                         Err(wrong) => self.send(WatchEvent::Wrong(wrong)).await,
                     }
                 }
