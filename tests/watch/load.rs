@@ -128,6 +128,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 Some((name, session::used_by(pid)?))
             });
             measured = Some((now, used.collect(), loopback()));
+            eprintln!("measuring");
         }
         if idle {
             sleep(Duration::from_millis(1));

@@ -231,6 +231,9 @@ async function touched(from, to) {
 }
 const [, tapped] = await touched([[200, 500]], [[200, 500]]);
 assert.ok(!tapped.touched, "a touch that moves nothing leaves the view to the page");
+// Fingers that zoom first, as a wheel does, take the view as well.
+const [far, nearer] = await touched([[180, 450], [210, 450]], [[175, 450], [215, 450]]);
+assert.ok(nearer.touched && away(nearer) < away(far), `${away(far)} to ${away(nearer)}`);
 const [still, turned] = await touched([[200, 500]], [[300, 420]]);
 const swung = Math.hypot(...turned.eye.map((x, axis) => x - still.eye[axis])) / away(still);
 assert.ok(swung > 0.2 && Math.abs(away(turned) / away(still) - 1) < 0.01, `a finger moves the camera by ${swung}`);

@@ -10,7 +10,7 @@ mod watching;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use bevy::prelude::*;
@@ -21,7 +21,9 @@ use pliant_net::watch::{
     PublishOptions, WatchCommands, WatchEvent, WatchNumbers, WatchPlugin, WatchState, WatchView, Watcher,
 };
 use pliant_net::{NetHost, NetPlugin, RemoteHands, SharedBody};
-use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, body_track, model_track, pieces};
+use pliant_stream::watch::{
+    BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchedState, body_track, model_track, pieces,
+};
 use pliant_stream::{BodyId, Placement, TickState};
 use relay::{Certificate, TestRelay};
 use support::{alone, app, bar, body_of, must, run_until, wait_for};
@@ -44,16 +46,22 @@ fn a_body_that_is_moved_and_painted_stays_and_glides() {
         watching.update();
         body_of(&mut watching)
     });
-    // The host's place by tick, along x.
-    let mut truth: BTreeMap<u64, f32> = BTreeMap::new();
-    let (mut seen, mut shown) = (Seen::default(), Vec::new());
+    let mut seen = Seen::default();
+    wait_for("the other watcher", || {
+        host.update();
+        seen.take(&mut other);
+        !seen.states.is_empty()
+    });
+    let before = seen.catalogs.len();
+    // The host's ticks, and what is shown.
+    let (mut ticks, mut shown) = (Vec::new(), Vec::new());
     for k in 0..400_u16 {
         let x = 1e-3 * f32::from(k);
         host.app.world_mut().get_mut::<Transform>(host.body).unwrap().translation.x = x;
         let color = Srgba::rgb(f32::from(k % 250) / 250.0, 0.0, 0.0);
         host.app.world_mut().entity_mut(host.body).insert(WatchView { color, hidden: false });
         host.update();
-        truth.insert(host.app.world().resource::<PliantTick>().0, x);
+        ticks.push(host.app.world().resource::<PliantTick>().0);
         watching.update();
         seen.take(&mut other);
         let there = body_of(&mut watching).expect("the body goes on");
@@ -61,19 +69,19 @@ fn a_body_that_is_moved_and_painted_stays_and_glides() {
         shown.push(watching.world().get::<Transform>(there).unwrap().translation.x);
     }
     let color = watching.world().get::<WatchView>(first).unwrap().color;
-    let seconds = truth.len() as f64 / 40.0;
-    println!("{} catalogs in {seconds} s, red {}, at {:?}", seen.catalogs.len(), color.red, shown.last());
+    let seconds = (ticks[ticks.len() - 1] - ticks[0]) as f64 / 40.0;
+    let catalogs = seen.catalogs.len() - before;
+    println!("{catalogs} catalogs in {seconds} s, red {}, at {:?}", color.red, shown.last());
     assert!(color.red > 0.0, "the color has not come");
-    assert!((seen.catalogs.len() as f64) < 14.0 * seconds + 3.0);
+    assert!((catalogs as f64) < 10.0 * seconds + 3.0);
     assert_eq!(seen.catalogs.iter().map(|catalog| catalog.bodies.len()).max(), Some(1));
-    // It goes on without jumps: never back, and never further at once than four ticks of the host.
-    let (low, high) = (*shown.first().unwrap(), *shown.last().unwrap());
+    // It goes on evenly: never back, and in most frames by some of the way.
+    let (low, high) = (shown[0], shown[shown.len() - 1]);
     assert!(low < 0.1 && high > 0.2, "from {low} to {high}");
-    let jump = shown.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f32::max);
     let back = shown.windows(2).map(|pair| pair[0] - pair[1]).fold(0.0, f32::max);
-    let tick = truth.values().zip(truth.values().skip(1)).map(|(a, b)| b - a).fold(0.0, f32::max);
-    println!("largest jump {jump}, back {back}, the host's in a tick {tick}");
-    assert!(jump < 4.0 * tick.max(0.01) && back < 1e-3, "{jump} forward, {back} back, {tick} in a tick");
+    let goes = shown.windows(2).filter(|pair| pair[1] > pair[0]).count();
+    println!("forward in {goes} of {} frames, back by {back} at most", shown.len());
+    assert!(back < 1e-3 && goes > shown.len() / 2, "forward in {goes} frames, back by {back}");
     // It rests where the host leaves it.
     run_until(&mut [&mut host.app, &mut watching], "the body at its last place", |apps| {
         let there = body_of(apps[1]).unwrap();
@@ -133,28 +141,33 @@ fn what_a_host_keeps_for_itself_is_not_sent() {
 fn a_file_that_the_host_keeps_is_not_given_to_who_knows_its_name() {
     let _alone = alone();
     for files in [true, false] {
-        let got = Arc::new(AtomicU64::new(0));
-        let count = got.clone();
+        let counts = Arc::new([AtomicU64::new(0), AtomicU64::new(0)]);
+        let of_task = counts.clone();
         let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
-            tokio::task::spawn_local(ask(origin.consume(), count));
+            tokio::task::spawn_local(ask(origin.consume(), of_task));
         });
         let mut publish = PublishOptions::new(options(&relay));
         publish.files = files;
         let mut host = Publisher::start(publish);
-        for _ in 0..800 {
+        let count = |k: usize| counts[k].load(Ordering::Relaxed);
+        let mut refused = None;
+        wait_for("the file, or ten refusals of a model that is published", || {
             host.update();
-            if got.load(Ordering::Relaxed) > 0 {
-                break;
+            let (_, stats) = host.app.world().resource::<NetHost>().published().unwrap();
+            if stats.frames > 10 {
+                refused.get_or_insert(count(1));
             }
-        }
-        let got = got.load(Ordering::Relaxed);
-        println!("files {files}: {got} bytes");
-        assert_eq!(got > 0, files);
+            let refused = refused.map_or(0, |before| count(1) - before);
+            must!(count(0) > 0 || refused >= 10, "{} bytes, {refused} refusals, {stats:?}", count(0));
+            Ok(())
+        });
+        println!("files {files}: {} bytes, {} refusals", count(0), count(1));
+        assert_eq!(count(0) > 0, files);
     }
 }
 
-/// Asks for the file of the bar again and again, and counts its bytes.
-async fn ask(origin: origin::Consumer, count: Arc<AtomicU64>) {
+/// Asks for the file of the bar again and again, and counts its bytes and the refusals.
+async fn ask(origin: origin::Consumer, counts: Arc<[AtomicU64; 2]>) {
     loop {
         let Ok(broadcast) = origin.routed_broadcast(NAME).await else { return };
         let wanted = moq_net::track::Subscription::default();
@@ -164,10 +177,11 @@ async fn ask(origin: origin::Consumer, count: Arc<AtomicU64>) {
             let mut track = track.ordered();
             while let Ok(Some(mut group)) = track.next_group().await {
                 while let Ok(Some(frame)) = group.read_frame().await {
-                    count.fetch_add(frame.payload.len() as u64, Ordering::Relaxed);
+                    counts[0].fetch_add(frame.payload.len() as u64, Ordering::Relaxed);
                 }
             }
         }
+        counts[1].fetch_add(1, Ordering::Relaxed);
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
 }
@@ -212,7 +226,8 @@ fn who_comes_late_sees_what_sleeps() {
                 _ => {}
             }
         }
-        must!(seen.len() == 2, "{} bodies have come, {} models", seen.len(), models.len());
+        let resting = seen.values().filter(|state: &&WatchedState| state.resting).count();
+        must!(resting == 2, "{resting} of {} bodies rest, {} models", seen.len(), models.len());
         Ok(())
     });
     assert_eq!((models["bar"].1.hash(), models["second"].1.hash()), (bar().hash(), second.hash()));
@@ -220,7 +235,7 @@ fn who_comes_late_sees_what_sleeps() {
     let truth = host.app.world().get::<BodyState>(body).unwrap().body().q();
     let off = watching::off(&bar(), &state.q, truth);
     println!("a sleeping body is off by {off:.1e} of its size");
-    assert!(state.resting && off < 1e-3);
+    assert!(off < 1e-3);
 }
 
 /// A relay that announces models without end, of which none comes, does not keep a true one out.
@@ -241,13 +256,14 @@ fn models_that_never_come_leave_room_for_one_that_does() {
     });
     println!("{} catalogs before the true model", seen.catalogs.len());
     assert!(seen.models.values().all(|model| model.hash() == bar().hash()));
-    assert!(seen.catalogs.len() > 20, "too few catalogs came to fill anything");
+    assert!(seen.catalogs.len() > 50, "too few catalogs came to fill anything");
 }
 
 async fn false_models(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
     let track = |name: &str| broadcast.create_track(name, None).unwrap();
     let mut catalogs = track("catalog");
     let _files = give(track(&model_track(model.hash())), &model);
+    let _ = catalogs.used().await;
     for k in 0..100_u8 {
         // The track is there, and nothing ever comes in it.
         let hash = ModelHash([k; 32]);
@@ -267,9 +283,11 @@ async fn false_models(broadcast: moq_net::broadcast::Producer, model: Arc<ModalM
 #[test]
 fn another_session_in_the_same_broadcast_is_seen() {
     let _alone = alone();
+    let second = Arc::new(AtomicBool::new(false));
+    let of_task = second.clone();
     let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
         let broadcast = origin.publish(NAME, origin::Route::default()).unwrap();
-        tokio::task::spawn_local(two_sessions(broadcast, bar()));
+        tokio::task::spawn_local(two_sessions(broadcast, bar(), of_task));
     });
     let mut watching = app(NetPlugin::default());
     watching.add_plugins(WatchPlugin);
@@ -290,17 +308,24 @@ fn another_session_in_the_same_broadcast_is_seen() {
             );
             Ok(())
         });
+        second.store(true, Ordering::Relaxed);
     }
 }
 
-async fn two_sessions(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
+async fn two_sessions(
+    broadcast: moq_net::broadcast::Producer,
+    model: Arc<ModalModel>,
+    second: Arc<AtomicBool>,
+) {
     let track = |name: &str| broadcast.create_track(name, None).unwrap();
     let mut catalogs = track("catalog");
     let _files = give(track(&model_track(model.hash())), &model);
     catalogs.write_frame(Timestamp::now(), catalog(1, entry(&model))).unwrap();
     let frames = track(&body_track(BodyId(1)));
     let changes = async {
-        tokio::time::sleep(Duration::from_secs(3)).await;
+        while !second.load(Ordering::Relaxed) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
         catalogs.write_frame(Timestamp::now(), catalog(2, entry(&model))).unwrap();
         std::future::pending::<()>().await;
     };

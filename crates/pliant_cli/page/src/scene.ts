@@ -269,6 +269,8 @@ export class Stage {
   readonly controls: OrbitControls;
   #hands = new Map<string, { ball: THREE.Mesh; arrow: THREE.ArrowHelper }>();
   #ball = new THREE.SphereGeometry(1, 20, 14);
+  /** Where the last picture, or the last framing, has left the camera. */
+  #left = new THREE.Vector3();
 
   constructor(canvas: HTMLCanvasElement) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
@@ -277,6 +279,7 @@ export class Stage {
     this.controls = new OrbitControls(this.eye.camera, canvas);
     this.controls.target = this.eye.target;
     this.controls.enableDamping = true;
+    this.#left.copy(this.eye.camera.position);
   }
 
   get largestTexture(): number {
@@ -291,8 +294,10 @@ export class Stage {
       one.mesh.updateWorldMatrix(true, false);
       bounds.union(one.mesh.geometry.boundingBox!.clone().applyMatrix4(one.mesh.matrixWorld));
     }
+    this.#notice();
     this.eye.frame(bounds, catalog.cameras[0]);
     this.controls.update();
+    this.#left.copy(this.eye.camera.position);
   }
 
   /** Draws the hands and their forces. The strongest force is as long as a third of the scene. */
@@ -331,6 +336,16 @@ export class Stage {
     }
   }
 
+  /**
+   * Whatever moved the camera since the last picture, in whichever handler, was somebody: framing
+   * says what it did. Rounding moves it by less, and a touch alone does not.
+   */
+  #notice(): void {
+    const { camera, size } = this.eye;
+    if (this.#left.distanceTo(camera.position) > 1e-4 * size) this.eye.touched = true;
+    this.#left.copy(camera.position);
+  }
+
   draw(): void {
     const canvas = this.renderer.domElement;
     const [wide, high] = [canvas.clientWidth, canvas.clientHeight];
@@ -341,10 +356,8 @@ export class Stage {
       this.renderer.setSize(wide, high, false);
       this.eye.resize(wide, high);
     }
-    const before = this.eye.camera.position.clone();
     this.controls.update();
-    // Nothing else moves the camera here; rounding moves it by less, and a touch alone does not.
-    if (before.distanceTo(this.eye.camera.position) > 1e-4 * this.eye.size) this.eye.touched = true;
+    this.#notice();
     this.renderer.render(this.scene, this.eye.camera);
   }
   /** For measurements: where the camera is, at what it looks, and its vertical angle, rad. */

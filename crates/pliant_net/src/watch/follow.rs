@@ -275,7 +275,9 @@ impl Scene {
                             // A relay that has lost the host may go on with another start of it.
                             let new = Some((catalog.session, catalog.step.to_bits()));
                             if std::mem::replace(&mut session, new) != new {
-                                bodies.clear();
+                                for id in std::mem::take(&mut bodies).into_keys() {
+                                    self.send(WatchEvent::Gone(id)).await;
+                                }
                             }
                             self.take(catalog, &mut bodies).await;
                         }

@@ -163,7 +163,12 @@ impl Watched {
                 }
                 state.catalog = Some(catalog);
             }
-            WatchEvent::Body(body, model) => self.arrived(world, body, model),
+            WatchEvent::Body(body, model) => {
+                // It may have been painted or moved while its model was fetched.
+                let bodies = state.catalog.as_ref().map_or(&[][..], |catalog| &catalog.bodies);
+                let now = bodies.iter().find(|now| body.goes_on_as(now)).cloned();
+                self.arrived(world, now.unwrap_or(body), model);
+            }
             WatchEvent::State(id, new) => {
                 state.frames += 1;
                 if let Some(clock) = &mut self.clock {

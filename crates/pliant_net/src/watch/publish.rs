@@ -144,10 +144,10 @@ struct PublishedBody {
     /// The thread was behind when the body was announced, so it is announced again.
     announced: bool,
     seen: bool,
-    /// Where an anchored body was at the last tick, and whether it has been moved since it was
-    /// announced. From then on its frames have poses.
-    placed: Placement,
+    /// An anchored body has been moved since it was announced. From then on its frames have poses.
     moves: bool,
+    /// Where it was in its last frame.
+    shown_at: Placement,
 }
 
 /// A body at a tick, as the host has it.
@@ -295,17 +295,15 @@ impl HostWatch {
                 color: [0; 4],
             };
             let model = seen.model.clone();
-            let placed = seen.placement;
-            let (announced, seen_now, moves) = (false, true, false);
-            let new = PublishedBody { encoder, entry, model, announced, seen: seen_now, placed, moves };
+            let (announced, moves, shown_at) = (false, false, seen.placement);
+            let new = PublishedBody { encoder, entry, model, announced, seen: true, moves, shown_at };
             self.bodies.insert(seen.id, new);
         }
         let Some(body) = self.bodies.get_mut(&seen.id) else { return };
         body.seen = true;
         let [r, g, b, a] = view.color.to_f32_array().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8);
-        let at_rest = body.placed == seen.placement;
-        body.placed = seen.placement;
-        body.moves |= !body.entry.free && !at_rest;
+        let place = |at: &Placement| (at.position, at.orientation);
+        body.moves |= !body.entry.free && place(&body.entry.placement) != place(&seen.placement);
         // Frames of a free body have its pose, and where it began says nothing. Those of an anchored
         // body do, too, once it is moved: a catalog is no way to send a movement.
         let placement = match (body.entry.free, body.moves) {
@@ -323,7 +321,8 @@ impl HostWatch {
         let state = match body.moves {
             true => TickState {
                 pose: Some(pose_of(&seen.placement)),
-                resting: seen.state.resting && at_rest,
+                // A sleeping body is awake for watchers until they have where it was moved to.
+                resting: seen.state.resting && body.shown_at == seen.placement,
                 ..*seen.state
             },
             false => *seen.state,
@@ -338,6 +337,7 @@ impl HostWatch {
         }
         match body.encoder.encode(&state) {
             Ok(Some(frame)) => {
+                body.shown_at = seen.placement;
                 let bytes = frame.bytes.len();
                 let item = Item::Frame(seen.id, seen.state.tick, frame.begins_group, frame.bytes);
                 if !self.send(item, bytes)

@@ -130,7 +130,10 @@ pub(super) struct Relay {
 impl Relay {
     /// Address for logs.
     pub(super) fn shown(&self) -> String {
-        without_token(self.url.as_str())
+        let mut url = self.url.clone();
+        // A URL without a host has no user either, and this one has a host.
+        let _ = url.set_username("").and_then(|()| url.set_password(None));
+        without_token(url.as_str())
     }
 
     /// Keeps a client connected, and calls `told` at each connection, and with the reason at each
@@ -149,6 +152,7 @@ impl Relay {
                     // Relays refuse a token when the connection is already there.
                     if since.elapsed() > PAUSES[1] {
                         pause = PAUSES[0];
+                        last = Default::default();
                     }
                     format!("the relay {} is lost: {end}", self.shown())
                 }
@@ -171,9 +175,13 @@ impl Relay {
 
     /// A text without the token of the relay's address, wherever it is from.
     fn without_secrets(&self, mut text: String) -> String {
-        let whole = self.url.query().map(str::to_owned);
+        let query = self.url.query().unwrap_or_default();
+        let written =
+            query.split('&').filter_map(|pair| pair.split_once('=')).map(|(_, value)| value.to_owned());
         let values = self.url.query_pairs().map(|(_, value)| value.into_owned());
-        for secret in whole.into_iter().chain(values).filter(|secret| !secret.is_empty()) {
+        let all = std::iter::once(query.to_owned()).chain(written).chain(values);
+        // Shorter values are no secrets, and may be anywhere in a text.
+        for secret in all.filter(|secret| secret.len() >= 8) {
             text = text.replace(&secret, "...");
         }
         text

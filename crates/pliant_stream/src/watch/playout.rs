@@ -1,5 +1,5 @@
 //! Which state to draw at which time: a little behind the host, so that there is a next state. The
-//! page in `page/playout.ts` does the same.
+//! page in `crates/pliant_cli/page/src/playout.ts` does the same.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -142,7 +142,9 @@ impl HandsPlayout {
         while self.frames.get(1).is_some_and(|next| next.tick as f64 <= tick) {
             self.frames.pop_front();
         }
-        let Some(from) = self.frames.front() else { return Vec::new() };
+        let Some(from) = self.frames.front().filter(|from| from.tick as f64 <= tick) else {
+            return Vec::new();
+        };
         let to = self.frames.get(1).unwrap_or(from);
         let span = (to.tick - from.tick) as f64;
         let part = if span > 0.0 { ((tick - from.tick as f64) / span).clamp(0.0, 1.0) } else { 0.0 };
@@ -226,7 +228,8 @@ mod tests {
         playout.push(frame(10, vec![hand(1, 1.0), hand(2, 5.0)]));
         playout.push(frame(12, vec![hand(3, 9.0), hand(1, 2.0)]));
         // One goes on, one ends with its frame, and one begins with its own.
-        assert_eq!(playout.at(9.0), [hand(1, 1.0), hand(2, 5.0)]);
+        assert_eq!(playout.at(9.0), []);
+        assert_eq!(playout.at(10.0), [hand(1, 1.0), hand(2, 5.0)]);
         assert_eq!(playout.at(11.0), [hand(1, 1.5), hand(2, 5.0)]);
         assert_eq!(playout.at(12.0), [hand(3, 9.0), hand(1, 2.0)]);
         assert_eq!(playout.at(1e9), [hand(3, 9.0), hand(1, 2.0)], "the newest stays");

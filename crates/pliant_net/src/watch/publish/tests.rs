@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use pliant_stream::watch::{BodyDecoder, coordinate_steps};
 use tokio::sync::mpsc::Receiver;
 
 use super::*;
@@ -95,4 +96,36 @@ fn the_end_of_a_body_takes_nothing_from_one_that_came_after() {
         tick(&mut watch, at, &[1, 2], &model);
     }
     assert_eq!((ends, models), (1, 2));
+}
+
+/// A sleeping body that is moved between two frames is seen where it is, and sleeps again there.
+#[test]
+fn a_sleeping_body_that_is_moved_is_sent() {
+    let (mut watch, mut items) = watch(1024);
+    watch.options.bodies.rate = 30.0;
+    let model = pip();
+    let mut decoder = BodyDecoder::new(coordinate_steps(&model, 30));
+    let (mut frames, q) = (Vec::new(), [0.0; 30]);
+    for tick in 1..=40 {
+        let moved = if tick >= 21 { 0.25 } else { 0.0 };
+        let placement = Placement { position: [moved, 0.0, 0.0], scale: 2.0, ..Placement::default() };
+        let state = TickState { tick, q: &q, v: &[], a: &[], z: &[], pose: None, grabs: &[], resting: true };
+        let (id, name, warps, view) = (BodyId(1), "pip", true, None);
+        let model = &model;
+        watch.body(&Seen { id, name, model, warps, placement, view, state: &state });
+        watch.finish(tick, WatchNumbers::default());
+        while let Ok(item) = items.try_recv() {
+            if let Item::Frame(_, tick, _, bytes) = item {
+                let (_, state) = decoder.decode(&bytes).unwrap();
+                frames.push((tick, state.pose.map(|pose| pose.position[0]), state.resting));
+            }
+        }
+    }
+    assert_eq!(
+        frames.iter().map(|(tick, _, resting)| (*tick, *resting)).collect::<Vec<_>>(),
+        [(2, true), (22, false), (24, true)]
+    );
+    assert_eq!(frames[0].1, None);
+    // In meters of the body, which is twice as large here.
+    assert!(frames[1..].iter().all(|frame| frame.1.is_some_and(|x| (x - 0.125).abs() < 1e-3)), "{frames:?}");
 }
