@@ -146,8 +146,8 @@ pub(super) fn run(
             mesh.begin(*fault);
         }
         if mesh.now >= HEALED {
-            // The malicious peer leaves at the end: where only some have kicked it, they differ from
-            // the others for as long as it is in the session.
+            // The malicious peer leaves at the end: where only some have kicked it, they differ
+            // from the others for as long as it is in the session.
             mesh.nodes[count - 1].session = None;
         }
         let present = if mesh.now < HEALED { count } else { count - 1 };

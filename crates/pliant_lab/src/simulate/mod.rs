@@ -1,5 +1,5 @@
-//! Whole sessions under faults, in virtual time: who crashes, stalls, is partitioned or lies, and when,
-//! follows from a seed, and so does all else.
+//! Whole sessions under faults, in virtual time: who crashes, stalls, is partitioned or lies, and
+//! when, follows from a seed, and so does all else.
 //!
 //! The even seeds are a host with guests, the odd ones a mesh of peers. The last of them is
 //! malicious. The others hold the body with a simulated device, whose loop has a thread of its own

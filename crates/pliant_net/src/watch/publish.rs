@@ -304,8 +304,8 @@ impl HostWatch {
         let [r, g, b, a] = view.color.to_f32_array().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8);
         let place = |at: &Placement| (at.position, at.orientation);
         body.moves |= !body.entry.free && place(&body.entry.placement) != place(&seen.placement);
-        // Frames of a free body have its pose, and where it began says nothing. Those of an anchored
-        // body do, too, once it is moved: a catalog is no way to send a movement.
+        // Frames of a free body have its pose, and where it began says nothing. Those of an
+        // anchored body do, too, once it is moved: a catalog is no way to send a movement.
         let placement = match (body.entry.free, body.moves) {
             (true, _) => Placement { scale: seen.placement.scale, ..Placement::default() },
             (false, true) => Placement { scale: seen.placement.scale, ..body.entry.placement },

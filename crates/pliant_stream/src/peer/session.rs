@@ -410,8 +410,8 @@ impl PeerSession {
             self.caught_up = self.caught_up.saturating_sub(1);
             due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
             if stepped == STEPS && due <= now {
-                // A stall of this machine and a jump of its clock look the same here. The ticks that
-                // the other peers report decide how many were missed.
+                // A stall of this machine and a jump of its clock look the same here. The ticks
+                // that the other peers report decide how many were missed.
                 let missed = ((now - due).as_secs_f64() / self.config.step) as u64;
                 self.missed = self.missed.saturating_add(missed).min(MAX_MISSED);
                 due = now + Duration::from_secs_f64(self.config.step);
