@@ -6,9 +6,9 @@
 #   tests/watch/load.sh BODY.modal [WHOLE_SECONDS [WATCHERS...]]
 #
 # RELAYS=2: two relays, of which the second fetches from the first, with half of the watchers each.
-# RATE: frames a second, 30 by default. AS: a command that runs the host, such as nice -n -5. In a
-# network namespace of its own (unshare -n sh -c 'ip link set lo up; tests/watch/load.sh ...') the
-# bytes that are told are these processes' alone.
+# MODELS=fetch: each fetches the model first. RATE: frames a second, 30 by default. AS: a command
+# that runs the host, such as nice -n -5. In a network namespace of its own (unshare -n sh -c 'ip
+# link set lo up; tests/watch/load.sh ...') the bytes that are told are these processes' alone.
 # Needs moq-relay 0.17.10 (PLIANT_MOQ_RELAY, or in PATH), openssl and Linux; ends with 77 (skipped)
 # without. Programs: those of BIN (a target folder's debug/ or release/), or built by cargo.
 set -u
