@@ -36,9 +36,41 @@ struct Bot {
     /// Time from the start of the bot to the first ready body.
     joined: Option<Duration>,
     grab: Option<u16>,
-    ticks: BTreeSet<u64>,
+    ticks: Ticks,
     bytes: u64,
     closed: Option<String>,
+}
+
+/// Number of ticks that a bot remembers, to count each once.
+const REMEMBERED: usize = 1024;
+
+/// The ticks that have arrived. A bot that runs for hours remembers the newest ones only.
+#[derive(Default)]
+struct Ticks {
+    first: Option<u64>,
+    count: u64,
+    newest: BTreeSet<u64>,
+}
+
+impl Ticks {
+    fn insert(&mut self, tick: u64) {
+        // What is older than all that is remembered stays missing.
+        let full = self.newest.len() >= REMEMBERED;
+        if full && self.newest.first().is_some_and(|oldest| tick < *oldest) || !self.newest.insert(tick) {
+            return;
+        }
+        self.first = Some(self.first.map_or(tick, |first| first.min(tick)));
+        self.count += 1;
+        if full {
+            self.newest.pop_first();
+        }
+    }
+
+    /// Ticks between the first and the newest one that never arrived.
+    fn missing(&self) -> u64 {
+        let span = self.first.zip(self.newest.last()).map_or(0, |(first, last)| last - first + 1);
+        span - self.count
+    }
 }
 
 pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), Box<dyn Error>> {
@@ -56,7 +88,7 @@ pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), 
             began: Instant::now(),
             joined: None,
             grab: None,
-            ticks: BTreeSet::new(),
+            ticks: Ticks::default(),
             bytes: 0,
             closed: None,
         });
@@ -89,12 +121,8 @@ fn report(all: &[Bot], start: Instant) {
     let mut joins: Vec<f64> = all.iter().filter_map(|bot| Some(bot.joined?.as_secs_f64())).collect();
     joins.sort_by(f64::total_cmp);
     let median = joins.get(joins.len() / 2).copied().unwrap_or(0.0);
-    // For each bot: the ticks between its first and its newest tick that never arrived.
-    let missing: u64 = all
-        .iter()
-        .filter_map(|bot| Some(bot.ticks.last()? - bot.ticks.first()? + 1 - bot.ticks.len() as u64))
-        .sum();
-    let received: usize = all.iter().map(|bot| bot.ticks.len()).sum();
+    let missing: u64 = all.iter().map(|bot| bot.ticks.missing()).sum();
+    let received: u64 = all.iter().map(|bot| bot.ticks.count).sum();
     let (guessed, repaired) =
         all.iter().filter_map(|bot| bot.session.as_ref()).fold((0, 0), |sum, session| {
             session.bodies().fold(sum, |(g, r), view| (g + view.counts().guessed, r + view.counts().repaired))
