@@ -380,8 +380,8 @@ impl HapticDevice for Inverse {
 
     fn safe_stop(&mut self) {
         if self.socket.is_some() {
-            // The service holds a force only as long as it is renewed. The zero acts at once, and
-            // the closed connection keeps it.
+            // What the service does with the last force of a closed connection is not published,
+            // so the last one is zero.
             let _ = self.ask([0.0; 3]);
         }
     }
