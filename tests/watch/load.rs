@@ -8,12 +8,12 @@
 //! CERTIFICATE is the hash of the relays' certificate, or `system` for what the system trusts. With
 //! MODELS=fetch in the environment every watcher fetches the model; otherwise they have it.
 //!
-//! Prints a line of JSON. Delays are behind the earliest arrival of any tick at any watcher, by the
-//! host's count of ticks: the path's own delay on loopback is not in them. A frame that a watcher
-//! has not heard counts as missing if the watcher has heard an earlier frame and a later one. Where
-//! a watcher has heard nothing for the last second, the frames since its last one count, too. Bytes
-//! and packets are all that crossed loopback: run it in a network namespace of its own where others
-//! use it too.
+//! Prints a line of JSON. The delay of a frame is how much later it arrived than the fastest frame
+//! of the run would have; the delay of that fastest frame itself is not known. A frame counts as
+//! missing for a watcher that received an earlier frame and a later one, but not this one. If a
+//! watcher received nothing in the last second of the run, all frames after its last one count as
+//! missing, too. Bytes and packets are all that crossed loopback, so run the program in a network
+//! namespace of its own if other programs use loopback.
 #![allow(missing_docs, reason = "a program for measurements")]
 
 #[path = "../../examples/session/mod.rs"]

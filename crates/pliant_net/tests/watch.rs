@@ -23,7 +23,7 @@ use pliant_net::watch::{
 };
 use pliant_net::{NetHost, NetPlugin, RemoteHands};
 use pliant_stream::watch::{BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchSurface};
-use pliant_stream::{BodyId, Placement, TickState};
+use pliant_stream::{BodyId, TickState};
 use relay::{Certificate, TestRelay};
 use support::{alone, app, bar, body_of, must, run_until, tick, wait_for};
 use watching::{NAME, Publisher, Seen, off, options};
@@ -261,19 +261,7 @@ async fn nonsense(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel
         }
         group.finish().unwrap();
     }
-    let entry = CatalogBody {
-        id: BodyId(1),
-        name: "a bar".into(),
-        model: model.hash(),
-        file_bytes: bytes.len() as u64,
-        surface_bytes: surface.len() as u64,
-        modes: 4,
-        every: 1,
-        warps: true,
-        free: false,
-        placement: Placement::default(),
-        color: [0; 4],
-    };
+    let entry = CatalogBody { surface_bytes: surface.len() as u64, ..watching::entry(&model) };
     let other = pliant_modal::ModelHash([7; 32]);
     let false_one = CatalogBody { id: BodyId(2), model: other, ..entry.clone() };
     let huge = CatalogBody {
@@ -387,6 +375,9 @@ fn a_link_has_the_certificate_and_the_relay_that_it_shall_have() {
     let mut options = PublishOptions::new(relay.with_certificate(&hash).unwrap());
     let expected = "#relay=https%3A%2F%2Fone.example%3A4443%2F&session=a%2Fb&certificate=";
     assert_eq!(options.link("https://page.example/"), format!("https://page.example/{expected}{hash}"));
+    options.relay.relay = "https://me:PASSWORD@one.example:4443/a@b?jwt=SECRET".into();
+    assert!(options.link("p").starts_with("p#relay=https%3A%2F%2Fone.example%3A4443%2Fa%40b&"));
+    options.relay.relay = "https://one.example:4443/?jwt=SECRET".into();
     options.link_relay = Some("https://one.example:4443/?jwt=THEIRS".into());
     let expected = "#relay=https%3A%2F%2Fone.example%3A4443%2F%3Fjwt%3DTHEIRS&session=a%2Fb&certificate=";
     assert_eq!(options.link("https://page.example/"), format!("https://page.example/{expected}{hash}"));

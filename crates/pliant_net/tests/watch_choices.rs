@@ -22,12 +22,12 @@ use pliant_net::watch::{
 };
 use pliant_net::{NetHost, NetPlugin, RemoteHands, SharedBody};
 use pliant_stream::watch::{
-    BodyEncoder, Catalog, CatalogBody, WatchConfig, WatchedState, body_track, model_track, pieces,
+    BodyEncoder, CatalogBody, WatchConfig, WatchHand, WatchHands, WatchedState, body_track, model_track,
 };
-use pliant_stream::{BodyId, Placement, TickState};
+use pliant_stream::{BodyId, TickState};
 use relay::{Certificate, TestRelay};
 use support::{alone, app, bar, body_of, must, run_until, wait_for};
-use watching::{NAME, Publisher, Seen, options};
+use watching::{NAME, Publisher, Seen, catalog, entry, give, options};
 
 /// A body that the host moves and paints in each frame stays the same entity for a watcher, goes
 /// the host's way evenly, and does not fill the catalog's track.
@@ -332,36 +332,6 @@ async fn two_sessions(
     tokio::join!(changes, swing(frames, &model));
 }
 
-fn entry(model: &ModalModel) -> CatalogBody {
-    CatalogBody {
-        id: BodyId(1),
-        name: "a bar".into(),
-        model: model.hash(),
-        file_bytes: model.to_bytes().len() as u64,
-        surface_bytes: 0,
-        modes: 4,
-        every: 1,
-        warps: true,
-        free: false,
-        placement: Placement::default(),
-        color: [0; 4],
-    }
-}
-
-fn catalog(session: u64, body: CatalogBody) -> Vec<u8> {
-    Catalog { session, step: 0.025, name: "lies".into(), bodies: vec![body], cameras: Vec::new() }.encode()
-}
-
-/// Publishes a model's file in a track, for as long as what is returned is kept.
-fn give(track: moq_net::track::Producer, model: &ModalModel) -> moq_net::track::Producer {
-    let mut group = track.append_group().unwrap();
-    for piece in pieces(&model.to_bytes()) {
-        group.write_frame(Timestamp::now(), piece.to_vec()).unwrap();
-    }
-    group.finish().unwrap();
-    track
-}
-
 /// Publishes frames of a body for ever.
 async fn swing(mut track: moq_net::track::Producer, model: &ModalModel) {
     let config = WatchConfig { rate: 40.0, ..WatchConfig::default() };
@@ -372,6 +342,46 @@ async fn swing(mut track: moq_net::track::Producer, model: &ModalModel) {
         if let Some(frame) = encoder.encode(&state).unwrap() {
             track.write_frame(Timestamp::now(), frame.bytes).unwrap();
         }
+        tokio::time::sleep(Duration::from_millis(25)).await;
+    }
+}
+
+/// A sleeping body's last frame may be long ago. Who comes late sees the hand on it all the same.
+#[test]
+fn a_hand_on_a_sleeping_body_is_seen_by_who_comes_late() {
+    let _alone = alone();
+    let relay = TestRelay::start_with(0, Certificate::new(), move |origin| {
+        let broadcast = origin.publish(NAME, origin::Route::default()).unwrap();
+        tokio::task::spawn_local(sleeping(broadcast, bar()));
+    });
+    let mut watching = app(NetPlugin::default());
+    watching.add_plugins(WatchPlugin);
+    watching.world_mut().commands().watch_session(options(&relay));
+    wait_for("the hand", || {
+        std::thread::sleep(Duration::from_millis(3));
+        watching.update();
+        let there = body_of(&mut watching)?;
+        let hands = watching.world().get::<RemoteHands>(there)?;
+        hands.0.first().map(|hand| assert_eq!(hand.target.to_array(), [1.0, 2.0, 3.0]))
+    });
+}
+
+async fn sleeping(broadcast: moq_net::broadcast::Producer, model: Arc<ModalModel>) {
+    let track = |name: &str| broadcast.create_track(name, None).unwrap();
+    let mut catalogs = track("catalog");
+    let _files = give(track(&model_track(model.hash())), &model);
+    catalogs.write_frame(Timestamp::now(), catalog(1, entry(&model))).unwrap();
+    let mut encoder = BodyEncoder::new(&model, WatchConfig::default(), 0.025).unwrap();
+    let q = [0.01; 4];
+    let state = TickState { tick: 100, q: &q, v: &[], a: &[], z: &[], pose: None, grabs: &[], resting: true };
+    let last = encoder.encode(&state).unwrap().unwrap();
+    let mut frames = track(&body_track(BodyId(1)));
+    frames.write_frame(Timestamp::now(), last.bytes).unwrap();
+    let mut hands = track("hands");
+    for tick in 100_000.. {
+        let hand = WatchHand { body: BodyId(1), target: [1.0, 2.0, 3.0], ..WatchHand::default() };
+        let frame = WatchHands { tick, hands: vec![hand], ..WatchHands::default() };
+        hands.write_frame(Timestamp::now(), frame.encode()).unwrap();
         tokio::time::sleep(Duration::from_millis(25)).await;
     }
 }

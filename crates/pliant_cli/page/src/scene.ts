@@ -360,6 +360,7 @@ export class Stage {
     this.#notice();
     this.renderer.render(this.scene, this.eye.camera);
   }
+
   /** For measurements: where the camera is, at what it looks, and its vertical angle, rad. */
   view() {
     const { camera, target, touched } = this.eye;

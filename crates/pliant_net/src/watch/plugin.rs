@@ -171,7 +171,8 @@ impl Watched {
             }
             WatchEvent::State(id, new) => {
                 state.frames += 1;
-                if let Some(clock) = &mut self.clock {
+                // Who comes late gets the last frame of a sleeping body, however old it is.
+                if let Some(clock) = self.clock.as_mut().filter(|_| !new.resting) {
                     clock.arrived(new.tick, now);
                 }
                 if let Some(body) = self.bodies.get_mut(&id) {
@@ -184,6 +185,10 @@ impl Watched {
                 }
             }
             WatchEvent::Hands(hands) => {
+                // They come while all bodies sleep, too, and say which tick it is.
+                if let Some(clock) = &mut self.clock {
+                    clock.arrived(hands.tick, now);
+                }
                 state.numbers = hands.numbers;
                 self.hands.push(hands);
             }

@@ -16,7 +16,7 @@ use pliant_stream::watch::{
     BodyEncoder, Catalog, CatalogBody, CatalogCamera, MAX_MODEL, WatchConfig, WatchHand, WatchHands,
     WatchNumbers, WatchSurface,
 };
-use pliant_stream::{BodyId, Placement, RigidState, Tick, TickState};
+use pliant_stream::{BodyId, MAGNITUDE_LIMIT, Placement, RigidState, Tick, TickState};
 use tokio::sync::mpsc::{Sender, channel};
 
 use self::carry::carry;
@@ -199,12 +199,11 @@ impl HostWatch {
             .build()
             .map_err(|error| WatchError::Setup(error.to_string()))?;
         let of_thread = shared.clone();
-        let scale = step;
         thread::Builder::new()
             .name("pliant-watch".into())
             .spawn(move || {
                 let tasks = tokio::task::LocalSet::new();
-                let end = runtime.block_on(tasks.run_until(carry(relay, name, items, of_thread, scale)));
+                let end = runtime.block_on(tasks.run_until(carry(relay, name, items, of_thread, step)));
                 if let Err(error) = end {
                     tracing::error!("nothing more is published for watchers: {error}");
                 }
@@ -279,7 +278,16 @@ impl HostWatch {
         if known == Some(false) || self.gone.iter().any(|gone| gone.id == seen.id) {
             return;
         }
+        // Frames of a free body have its pose, and where it began says nothing.
+        let free = seen.model.is_free();
+        let scaled = Placement { scale: seen.placement.scale, ..Placement::default() };
+        let placement = if free { scaled } else { seen.placement };
         if known.is_none() {
+            // Watchers refuse a catalog with a place out of range, and with it all bodies.
+            if !placement.is_valid() {
+                warn_once!("{} is too far away or too large for watchers", seen.name);
+                return;
+            }
             let Ok(encoder) = BodyEncoder::new(seen.model, self.options.bodies, self.step) else { return };
             let entry = CatalogBody {
                 id: seen.id,
@@ -290,8 +298,8 @@ impl HostWatch {
                 modes: encoder.modes() as u16,
                 every: encoder.every() as u16,
                 warps: seen.warps,
-                free: seen.model.is_free(),
-                placement: seen.placement,
+                free,
+                placement,
                 color: [0; 4],
             };
             let model = seen.model.clone();
@@ -303,21 +311,21 @@ impl HostWatch {
         body.seen = true;
         let [r, g, b, a] = view.color.to_f32_array().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8);
         let place = |at: &Placement| (at.position, at.orientation);
-        body.moves |= !body.entry.free && place(&body.entry.placement) != place(&seen.placement);
-        // Frames of a free body have its pose, and where it began says nothing. Those of an
-        // anchored body do, too, once it is moved: a catalog is no way to send a movement.
-        let placement = match (body.entry.free, body.moves) {
-            (true, _) => Placement { scale: seen.placement.scale, ..Placement::default() },
-            (false, true) => Placement { scale: seen.placement.scale, ..body.entry.placement },
-            (false, false) => seen.placement,
-        };
-        let (name, warps, color) = (seen.name.to_owned(), seen.warps, [r, g, b, a]);
-        let entry = CatalogBody { name, warps, placement, color, ..body.entry.clone() };
-        if entry != body.entry {
-            let goes_on = body.entry.goes_on_as(&entry);
-            self.catalog = self.catalog.max(if goes_on { CatalogNews::Looks } else { CatalogNews::Bodies });
-            body.entry = entry;
+        body.moves |= !free && place(&body.entry.placement) != place(&seen.placement);
+        // Once an anchored body is moved, its frames have its pose, too: a catalog is no way to send
+        // a movement.
+        let placement = Placement { scale: seen.placement.scale, ..body.entry.placement };
+        let placement = if placement.is_valid() { placement } else { body.entry.placement };
+        let (entry, color) = (&mut body.entry, [r, g, b, a]);
+        if entry.warps != seen.warps {
+            self.catalog = CatalogNews::Bodies;
         }
+        if entry.name != seen.name || (entry.placement, entry.color) != (placement, color) {
+            self.catalog = self.catalog.max(CatalogNews::Looks);
+            entry.name.clear();
+            entry.name.push_str(seen.name);
+        }
+        (entry.warps, entry.placement, entry.color) = (seen.warps, placement, color);
         let state = match body.moves {
             true => TickState {
                 pose: Some(pose_of(&seen.placement)),
@@ -354,7 +362,9 @@ impl HostWatch {
 
     /// A hand at this tick, in world axes.
     pub(crate) fn hand(&mut self, hand: WatchHand) {
-        if self.options.hands {
+        // Watchers refuse all hands of a tick for one number that is none.
+        let sound = |x: &f64| x.abs() <= MAGNITUDE_LIMIT;
+        if self.options.hands && hand.target.iter().chain(&hand.reaction).all(sound) {
             self.hands.push(hand);
         }
     }

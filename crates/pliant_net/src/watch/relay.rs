@@ -115,9 +115,13 @@ impl RelayOptions {
     }
 }
 
-/// A relay's address as logs and watchers may have it: what follows the question mark is secret.
+/// A relay's address as logs and watchers may have it: what follows the question mark is secret, and
+/// so are a user and a password.
 pub(super) fn without_token(relay: &str) -> String {
-    relay.split(['?', '#']).next().unwrap_or_default().to_owned()
+    let shown = relay.split(['?', '#']).next().unwrap_or_default();
+    let Some((scheme, rest)) = shown.split_once("://") else { return shown.to_owned() };
+    let (host, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+    format!("{scheme}://{}{path}", host.rsplit('@').next().unwrap_or_default())
 }
 
 /// A relay to connect to.
@@ -130,10 +134,7 @@ pub(super) struct Relay {
 impl Relay {
     /// Address for logs.
     pub(super) fn shown(&self) -> String {
-        let mut url = self.url.clone();
-        // A URL without a host has no user either, and this one has a host.
-        let _ = url.set_username("").and_then(|()| url.set_password(None));
-        without_token(url.as_str())
+        without_token(self.url.as_str())
     }
 
     /// Keeps a client connected, and calls `told` at each connection, and with the reason at each

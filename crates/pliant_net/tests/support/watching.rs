@@ -7,12 +7,13 @@ use std::time::{Duration, Instant};
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
+use moq_net::Timestamp;
 use pliant_body::{BodyState, Grab, GrabOf, PliantTick};
 use pliant_modal::ModalModel;
 use pliant_net::watch::{PublishOptions, RelayOptions, WatchEvent, Watcher};
 use pliant_net::{HostConfig, NetHost};
-use pliant_stream::BodyId;
-use pliant_stream::watch::{Catalog, WatchHands};
+use pliant_stream::watch::{Catalog, CatalogBody, WatchHands, pieces};
+use pliant_stream::{BodyId, Placement};
 
 use super::relay::TestRelay;
 use super::support::{TIP, host};
@@ -95,4 +96,35 @@ pub fn off(model: &ModalModel, a: &[f64], b: &[f64]) -> f64 {
         a.distance(b)
     };
     (0..vertices).map(apart).fold(0.0, f64::max) / model.size()
+}
+
+/// The bar, as a catalog has it.
+pub fn entry(model: &ModalModel) -> CatalogBody {
+    CatalogBody {
+        id: BodyId(1),
+        name: "a bar".into(),
+        model: model.hash(),
+        file_bytes: model.to_bytes().len() as u64,
+        surface_bytes: 0,
+        modes: 4,
+        every: 1,
+        warps: true,
+        free: false,
+        placement: Placement::default(),
+        color: [0; 4],
+    }
+}
+
+pub fn catalog(session: u64, body: CatalogBody) -> Vec<u8> {
+    Catalog { session, step: 0.025, name: "lies".into(), bodies: vec![body], cameras: Vec::new() }.encode()
+}
+
+/// Publishes a model's file in a track, for as long as what is returned is kept.
+pub fn give(track: moq_net::track::Producer, model: &ModalModel) -> moq_net::track::Producer {
+    let mut group = track.append_group().unwrap();
+    for piece in pieces(&model.to_bytes()) {
+        group.write_frame(Timestamp::now(), piece.to_vec()).unwrap();
+    }
+    group.finish().unwrap();
+    track
 }

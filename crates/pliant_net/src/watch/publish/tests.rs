@@ -129,3 +129,37 @@ fn a_sleeping_body_that_is_moved_is_sent() {
     // In meters of the body, which is twice as large here.
     assert!(frames[1..].iter().all(|frame| frame.1.is_some_and(|x| (x - 0.125).abs() < 1e-3)), "{frames:?}");
 }
+
+/// A body at the end of the world, and a hand there, leave the others in the catalog and in the
+/// frames.
+#[test]
+fn what_is_out_of_range_costs_the_others_nothing() {
+    let (mut watch, mut items) = watch(1024);
+    let (model, q) = (pip(), [0.0; 30]);
+    for tick in 1..=20 {
+        let state = TickState { tick, q: &q, v: &[], a: &[], z: &[], pose: None, grabs: &[], resting: false };
+        // The third one is thrown there, and the fourth one grows without end.
+        let far = if tick < 10 { 0.0 } else { 1e30 };
+        let size = if tick < 10 { 1.0 } else { 1e30 };
+        for (id, x, scale) in [(1, 0.0, 1.0), (2, 1e7, 1.0), (3, far, 1.0), (4, 0.0, size)] {
+            let placement = Placement { position: [x, 0.0, 0.0], scale, ..Placement::default() };
+            let (id, name, warps, view, model) = (BodyId(id), "pip", true, None, &model);
+            watch.body(&Seen { id, name, model, warps, placement, view, state: &state });
+        }
+        watch.hand(WatchHand { target: [f64::NAN, 0.0, 0.0], ..WatchHand::default() });
+        watch.hand(WatchHand { reaction: [0.0, 1e30, 0.0], ..WatchHand::default() });
+        watch.hand(WatchHand { target: [1.0, 0.0, 0.0], ..WatchHand::default() });
+        watch.finish(tick, WatchNumbers::default());
+        while let Ok(item) = items.try_recv() {
+            match item {
+                Item::Catalog(_, bytes) => {
+                    let ids: Vec<u16> =
+                        Catalog::decode(&bytes).unwrap().bodies.iter().map(|b| b.id.0).collect();
+                    assert_eq!(ids, [1, 3, 4], "tick {tick}");
+                }
+                Item::Hands(_, bytes) => assert_eq!(WatchHands::decode(&bytes).unwrap().hands.len(), 1),
+                _ => {}
+            }
+        }
+    }
+}

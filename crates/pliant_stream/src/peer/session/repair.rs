@@ -67,8 +67,8 @@ impl PeerSession {
     /// The number of ticks that are stepped again if one changes for some bodies.
     pub(super) fn ticks_to_resimulate(&self, bodies: &[BodyId], tick: Tick) -> u64 {
         let tick = tick.max(self.taken + 1);
-        let resimulated_to = bodies.iter().filter_map(|id| self.bodies.get(id)).map(PeerBody::resimulated_to);
-        resimulated_to.max().map_or(0, |resimulated_to| (resimulated_to + 1).saturating_sub(tick))
+        let ends = bodies.iter().filter_map(|id| self.bodies.get(id)).map(PeerBody::resimulated_to);
+        ends.max().map_or(0, |end| (end + 1).saturating_sub(tick))
     }
 
     /// Marks a tick that has changed for some bodies. What is before the last state that was taken
