@@ -311,6 +311,13 @@ export class Stage {
         const color = colorOf(hand.user);
         const ball = new THREE.Mesh(this.#ball, new THREE.MeshBasicMaterial({ color }));
         const arrow = new THREE.ArrowHelper(undefined, undefined, 1, color);
+        // A body pulls back into itself: its force is seen through it.
+        for (const part of [ball, arrow.line, arrow.cone]) {
+          const material = part.material as THREE.Material;
+          material.depthTest = false;
+          material.transparent = true;
+          part.renderOrder = 1;
+        }
         shown = { ball, arrow };
         this.#hands.set(key, shown);
         this.scene.add(ball, arrow);
