@@ -251,6 +251,60 @@ fn strangers_that_send_all_they_can_hold_up_no_frame_and_bar_nobody() {
     assert!(most <= MAX_READ, "{most} bytes read in one frame");
 }
 
+/// Guests that each take hold of the whole body, as often as their budget allows, all in the same
+/// moment: a frame makes a few milliseconds' worth of patches, and the other hands come with the
+/// next frames.
+#[test]
+fn whole_body_grabs_of_many_guests_at_once_come_a_few_in_a_frame() {
+    let _alone = alone();
+    let model = bar_of(CELLS);
+    let transport = HostOptions { limits: limits(), ..HostOptions::default() };
+    let (mut host, invite, _) = host_of(HostConfig { transport, ..HostConfig::default() }, model.clone());
+    let guests: Vec<Endpoint> = (0..7)
+        .map(|_| {
+            let limits = Limits { message: Limits::guest().message, ..limits() };
+            Endpoint::join(&invite, JoinOptions { limits, ..JoinOptions::default() }).unwrap()
+        })
+        .collect();
+    let send = |guest: &Endpoint, message: GuestMessage| {
+        guest.send_message(PeerId::HOST, message.encode().into()).unwrap();
+    };
+    let mut greeted = vec![false; guests.len()];
+    run_until(&mut [&mut host], "the guests are in", |apps| {
+        for (guest, greeted) in guests.iter().zip(&mut greeted) {
+            while let Some(event) = guest.poll() {
+                if matches!(event, Event::Connected { .. }) {
+                    let subscription =
+                        StreamSubscription { payload: Payload::Forces, modes: 4, repeats: 0, refresh: 60 };
+                    let (version, name, cached) = (PROTOCOL_VERSION, "guest".into(), vec![model.hash().0]);
+                    send(guest, GuestMessage::Hello { version, name, subscription, cached });
+                    *greeted = true;
+                }
+            }
+        }
+        apps[0].world().resource::<NetHost>().session().users().count() == guests.len()
+    });
+    for guest in &guests {
+        for grab in 0..2 {
+            let (target, hold) = ([1.0, 0.0, 0.0], Default::default());
+            send(guest, GuestMessage::GrabBegin { grab, body: 1, vertex: 9, radius: 1.0, target, hold });
+        }
+    }
+    // All of it waits at the host before its next frame.
+    std::thread::sleep(Duration::from_millis(500));
+    let mut hands = host.world_mut().query::<&HandOf>();
+    let (mut held, mut begun) = (0, Vec::new());
+    for _ in 0..60 {
+        host.update();
+        let now = hands.iter(host.world()).count();
+        begun.push(now - held);
+        held = now;
+    }
+    // All may have 65,536 vertices at once and more with time; each hand takes 10,004.
+    assert!(held >= 7, "{begun:?}");
+    assert!(begun.iter().all(|hands| *hands <= 1), "hands that took hold in each frame: {begun:?}");
+}
+
 /// Run by hand, on a quiet machine and with `--release`.
 #[test]
 #[ignore = "measures times"]

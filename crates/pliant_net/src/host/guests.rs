@@ -23,8 +23,7 @@ pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut host: Mut<NetHost>| {
         let host = &mut *host;
         host.carrier.begin_frame();
-        let frame: Vec<Event> = std::iter::from_fn(|| host.carrier.poll_in_frame()).collect();
-        for event in frame {
+        while let Some(event) = host.carrier.poll_in_frame() {
             let now = host.now();
             match event {
                 Event::Connected { peer, address, fingerprint, role } => {
@@ -40,7 +39,10 @@ pub(crate) fn receive(world: &mut World) {
                     let at = at.saturating_duration_since(host.began);
                     host.session.on_datagram(at, peer, &bytes);
                 }
-                Event::Message { peer, bytes } => host.session.on_message(now, peer, &bytes),
+                Event::Message { peer, bytes } => {
+                    host.session.on_message(now, peer, &bytes);
+                    host.carrier.charge(host.session.take_work());
+                }
                 Event::Closed { peer, reason } => {
                     debug!("guest {peer} is gone: {reason}");
                     host.session.disconnect(peer, reason);

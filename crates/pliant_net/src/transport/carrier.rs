@@ -39,6 +39,11 @@ pub trait Carrier: Any + Send + Sync {
         self.poll()
     }
 
+    /// Counts work that a message of this frame has made for the host, in vertices of new patches.
+    /// Where [`Carrier::poll_in_frame`] bounds a frame, the messages wait for the next one once
+    /// there is enough. Does nothing by default.
+    fn charge(&self, _work: usize) {}
+
     /// Returns the connected peers, in the order in which they connected.
     fn peers(&self) -> Vec<PeerId>;
 

@@ -243,6 +243,10 @@ impl Carrier for Endpoint {
         self.shared.connections.inbox.pop_in_frame()
     }
 
+    fn charge(&self, work: usize) {
+        self.shared.connections.inbox.charge(work);
+    }
+
     fn peers(&self) -> Vec<PeerId> {
         self.shared.connections.peers()
     }

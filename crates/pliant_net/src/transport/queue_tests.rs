@@ -73,6 +73,37 @@ fn a_queue_of_messages_delays_nobody_elses() {
 }
 
 #[test]
+fn messages_wait_for_the_next_frame_after_enough_work_and_hands_move_on() {
+    let inbox = Inbox::default();
+    let (first, second) = (PeerId(1), PeerId(2));
+    for peer in [first, second] {
+        inbox.open(peer, left(peer));
+        inbox.pop().unwrap();
+        for _ in 0..2 {
+            inbox.push_message(peer, bytes(0), 64 << 20).unwrap();
+            inbox.push_datagram(peer, Instant::now(), bytes(1), 64);
+        }
+    }
+    // What is read in each frame, and what each message of it costs.
+    for (messages, datagrams, work) in [(1, 4, WORK_IN_A_FRAME), (1, 0, 1 << 40), (2, 0, WORK_IN_A_FRAME / 2)]
+    {
+        inbox.begin_frame();
+        let mut read = (0, 0);
+        while let Some(event) = inbox.pop_in_frame() {
+            if matches!(event, Event::Message { .. }) {
+                inbox.charge(work);
+                read.0 += 1;
+            } else {
+                read.1 += 1;
+            }
+        }
+        assert_eq!(read, (messages, datagrams));
+    }
+    inbox.begin_frame();
+    assert!(inbox.pop_in_frame().is_none());
+}
+
+#[test]
 fn a_frame_reads_a_share_of_each_peer_and_no_more_than_its_budget() {
     let inbox = Inbox::default();
     let full = Bytes::from(vec![2; 1155]);

@@ -103,8 +103,8 @@ impl PatchBudget {
         Self { patches: Budget::empty(now, 4.0, 16.0), entries: Budget::empty(now, 512.0, 2048.0) }
     }
 
-    /// Pays for a new patch, also from what is for all or the user's own `share` of it, and returns
-    /// whether the budgets allow it.
+    /// Pays for a new patch, also from what is for all or the user's own `share` of it. Returns the
+    /// number of vertices within its radius, or `None` where the budgets do not allow it.
     pub(crate) fn spend(
         &mut self,
         [all, share]: [&mut Self; 2],
@@ -112,13 +112,16 @@ impl PatchBudget {
         model: &ModalModel,
         vertex: u32,
         radius: f64,
-    ) -> bool {
+    ) -> Option<usize> {
         // The vertices are counted last, because that takes a while.
         if !self.patches.spend(now, 1.0) || !pay(&mut all.patches, &mut share.patches, now, 1.0) {
-            return false;
+            return None;
         }
-        let entries = entries(model, vertex, radius);
-        self.entries.spend_or_owe(now, entries) && pay(&mut all.entries, &mut share.entries, now, entries)
+        let count = entries(model, vertex, radius);
+        let entries = count as f64;
+        let paid = self.entries.spend_or_owe(now, entries)
+            && pay(&mut all.entries, &mut share.entries, now, entries);
+        paid.then_some(count)
     }
 }
 
@@ -128,11 +131,11 @@ pub(crate) fn pay(all: &mut Budget, share: &mut Budget, now: Duration, amount: f
 }
 
 /// Number of vertices within the radius, of which a patch has some or all.
-fn entries(model: &ModalModel, vertex: u32, radius: f64) -> f64 {
+fn entries(model: &ModalModel, vertex: u32, radius: f64) -> usize {
     let positions = model.surface().positions();
-    let Some(center) = positions.get(vertex as usize) else { return 1.0 };
+    let Some(center) = positions.get(vertex as usize) else { return 1 };
     let distance2 = |p: &[f32; 3]| (0..3).map(|k| f64::from(p[k] - center[k]).powi(2)).sum::<f64>();
-    positions.iter().filter(|p| distance2(p) <= radius * radius).count() as f64
+    positions.iter().filter(|p| distance2(p) <= radius * radius).count()
 }
 
 /// The budget of the snapshots or states that one user gets.

@@ -176,7 +176,7 @@ impl RemotePeer {
         held: &HeldAt,
     ) -> bool {
         let all = [&mut all.patches, &mut self.share.patches];
-        self.budgets.patches.spend(all, now, model, held.vertex, held.radius)
+        self.budgets.patches.spend(all, now, model, held.vertex, held.radius).is_some()
     }
 
     /// Returns whether the peer has connected by itself and said nothing since.

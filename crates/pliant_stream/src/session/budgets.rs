@@ -78,8 +78,8 @@ impl SharedBudgets {
 }
 
 impl GuestPeer {
-    /// Pays for a new patch, and returns whether the budgets allow it. Each patch costs every
-    /// encoder of its body a table over its vertices.
+    /// Pays for a new patch, and returns its number of vertices if the budgets allow it. Each patch
+    /// costs every encoder of its body a table over its vertices.
     pub(super) fn pays_for_patch(
         &mut self,
         all: &mut SharedBudgets,
@@ -87,7 +87,7 @@ impl GuestPeer {
         model: &ModalModel,
         vertex: u32,
         radius: f64,
-    ) -> bool {
+    ) -> Option<usize> {
         let all = [&mut all.patches, &mut self.share.patches];
         self.budgets.patches.spend(all, now, model, vertex, radius)
     }

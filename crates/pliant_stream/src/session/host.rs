@@ -107,6 +107,8 @@ pub struct HostSession {
     pub(super) encoders_made: u64,
     /// What all guests together may cost the host.
     shared: SharedBudgets,
+    /// Work for the app since it was last asked for, vertices of new patches.
+    work: usize,
     /// Budgets of the users that are away.
     away: AwayBudgets<GuestBudgets>,
     /// Counts of the connections that have ended.
@@ -140,6 +142,7 @@ impl HostSession {
             encoded: 0,
             encoders_made: 0,
             shared: SharedBudgets::of_all(),
+            work: 0,
             away: AwayBudgets::default(),
             gone: LinkStats::default(),
         })

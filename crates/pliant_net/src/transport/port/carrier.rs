@@ -32,6 +32,10 @@ impl Carrier for PortCarrier {
         self.connections.inbox.pop_in_frame()
     }
 
+    fn charge(&self, work: usize) {
+        self.connections.inbox.charge(work);
+    }
+
     fn peers(&self) -> Vec<PeerId> {
         self.connections.peers()
     }

@@ -83,6 +83,13 @@ impl HostSession {
         }
     }
 
+    /// Returns the work that messages have made for the app since the last call, in vertices within
+    /// the radii of new patches. An app that has a frame's worth of it processes further messages
+    /// in the next one.
+    pub fn take_work(&mut self) -> usize {
+        std::mem::take(&mut self.work)
+    }
+
     /// Processes a received message. A message that breaks the protocol ends the guest's session.
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
@@ -141,14 +148,13 @@ impl HostSession {
                 // The budget limits new patches, since each costs every encoder of the body a
                 // table.
                 let model = self.bodies.get(&body).map(|b| &b.model);
-                let fits = p.role == Role::Hold
-                    && p.grabs.len() < MAX_GUEST_GRABS
-                    && !p.grabs.contains_key(&grab)
-                    && model.is_some_and(|model| {
-                        (vertex as usize) < model.surface().positions().len()
-                            && p.pays_for_patch(&mut self.shared, now, model, vertex, radius)
-                    });
-                if fits {
+                let may =
+                    p.role == Role::Hold && p.grabs.len() < MAX_GUEST_GRABS && !p.grabs.contains_key(&grab);
+                let on = |model: &&Arc<ModalModel>| (vertex as usize) < model.surface().positions().len();
+                let model = model.filter(|model| may && on(model));
+                let paid = model.and_then(|m| p.pays_for_patch(&mut self.shared, now, m, vertex, radius));
+                if let Some(entries) = paid {
+                    self.work += entries;
                     p.grabs.insert(grab, AnnouncedGrab { body, input: None });
                     let key = GrabKey { user, grab };
                     self.event(HostEvent::GrabBegan { key, body, vertex, radius, target, hold });
