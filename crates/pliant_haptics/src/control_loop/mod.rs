@@ -19,7 +19,11 @@ pub(crate) mod touch;
 pub(crate) mod validation;
 
 /// What threads share. Tests put loom's in its place.
+#[cfg_attr(
+    not(any(feature = "inverse", feature = "vendor")),
+    expect(unused_imports, reason = "real devices alone share connections")
+)]
 pub(crate) mod sync {
-    pub(crate) use std::sync::Arc;
     pub(crate) use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
+    pub(crate) use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 }

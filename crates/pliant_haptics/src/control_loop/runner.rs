@@ -114,7 +114,7 @@ impl HapticLoop {
                     // Above the loop's own priority, so that a driver that spins cannot starve it.
                     // The loop warns if it is not allowed.
                     let _ = raise_priority(SUPERVISOR_PRIORITY);
-                    supervise(&heartbeat, &*handle, &stop, clock, &name);
+                    supervise(&heartbeat, &handle, &stop, clock, &name);
                 })
                 .map_err(|error| StartError::Thread(error.to_string()))?;
         }

@@ -22,10 +22,7 @@
 use std::{
     io::Write,
     net::{Shutdown, TcpStream, ToSocketAddrs},
-    sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::Arc,
     time::Duration,
 };
 
@@ -35,7 +32,7 @@ use tungstenite::{Message, WebSocket, client::client_with_config, protocol::WebS
 
 use crate::{
     Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, StopHandle, Wrench,
-    device::renewal::Renewal,
+    device::{link::Link, renewal::Renewal},
 };
 
 /// Address of the service and choice of the device.
@@ -169,21 +166,19 @@ impl Status {
 
 /// Ends the connection from another thread, with a command without a force as the last thing it
 /// sends.
-#[derive(Debug, Default)]
-struct ConnectionSwitch {
-    /// The connection's other end and the frame of that command.
-    open: Mutex<Option<(TcpStream, Vec<u8>)>>,
-    cut: AtomicBool,
-}
+///
+/// A cut acts on the other end of the connection and sends the frame of that command.
+struct ConnectionSwitch(Link<Arc<(TcpStream, Vec<u8>)>>);
 
 impl StopHandle for ConnectionSwitch {
     fn cut(&self) {
-        self.cut.store(true, Ordering::Release);
-        let open = self.open.lock().unwrap_or_else(PoisonError::into_inner).take();
-        if let Some((mut stream, zero)) = open {
+        if let Some(cut) = self.0.cut() {
+            let (stream, zero) = &*cut.device;
+            // A service that reads nothing must not hold up the end of the connection.
+            let _ = stream.set_nonblocking(true);
             // The loop's thread may be in the middle of a command. The service cannot read either
             // then, and the end of the connection is all that is left.
-            let _ = stream.write_all(&zero);
+            let _ = (&*stream).write_all(zero);
             let _ = stream.shutdown(Shutdown::Both);
         }
     }
@@ -242,32 +237,37 @@ impl Inverse {
             last,
             status,
             sequence: 0,
-            switch: Arc::default(),
+            switch: Arc::new(ConnectionSwitch(Link::new())),
             renewal: Renewal::default(),
             late: false,
         };
-        device.take(socket);
+        let address = device.config.address.clone();
+        let reason = |_| InverseError::Connect { address, reason: "its connection was cut".into() };
+        device.take(socket).map_err(reason)?;
         Ok(device)
     }
 
-    /// Takes a new connection, which the supervisor may end.
-    fn take(&mut self, socket: WebSocket<TcpStream>) {
+    /// Takes a new connection, which the supervisor may end. One that was cut while it was being
+    /// made is closed, and no force is sent on it.
+    fn take(&mut self, socket: WebSocket<TcpStream>) -> Result<(), Fault> {
         self.sequence = 0;
         (self.renewal, self.late) = (Renewal::default(), false);
         let zero = text_frame(&self.command([0.0; 3], false));
-        // Without a second handle of the socket, only the end of the loop closes the connection.
-        let open = socket.get_ref().try_clone().ok().map(|stream| (stream, zero));
-        self.switch.cut.store(false, Ordering::Release);
-        *self.switch.open.lock().unwrap_or_else(PoisonError::into_inner) = open;
-        self.socket = Some(socket);
+        let stream = socket.get_ref().try_clone().map_err(|_| Fault::Gone)?;
+        if self.switch.0.open(Arc::new((stream, zero))) {
+            self.socket = Some(socket);
+            return Ok(());
+        }
+        self.abandon();
+        Err(Fault::Gone)
     }
 
     /// Forgets a connection on which nothing more can be said.
     fn abandon(&mut self) {
         self.socket = None;
-        if let Some((stream, _)) = self.switch.open.lock().unwrap_or_else(PoisonError::into_inner).take() {
+        if let Some(open) = self.switch.0.close() {
             // A second handle would keep the connection open.
-            let _ = stream.shutdown(Shutdown::Both);
+            let _ = open.0.shutdown(Shutdown::Both);
         }
     }
 
@@ -353,14 +353,12 @@ impl HapticDevice for Inverse {
         let force = if idle { [0.0; 3] } else { wrench.force };
         let answer = match self.ask(force) {
             // The first command was refused, so the service may know the field by its other name.
-            Err(Fault::Gone | Fault::Malformed)
-                if !self.confirmed && !self.switch.cut.load(Ordering::Acquire) =>
-            {
+            Err(Fault::Gone | Fault::Malformed) if !self.confirmed && !self.switch.0.seen().cut => {
                 self.spelling = self.spelling.other();
                 self.confirmed = true;
                 self.abandon();
                 let (socket, _) = connect(&self.config).map_err(|_| Fault::Gone)?;
-                self.take(socket);
+                self.take(socket)?;
                 self.ask(force)?
             }
             other => other?,
@@ -392,10 +390,12 @@ impl HapticDevice for Inverse {
 
     fn reopen(&mut self) -> Result<(), Fault> {
         self.abandon();
+        if !self.switch.0.begin() {
+            return Err(Fault::Gone);
+        }
         let (socket, inventory) = connect(&self.config).map_err(|_| Fault::Gone)?;
         (self.id, self.last, self.status) = pick(&self.config, &inventory).map_err(|_| Fault::Gone)?;
-        self.take(socket);
-        Ok(())
+        self.take(socket)
     }
 }
 

@@ -5,6 +5,9 @@ pub(crate) mod find;
 pub(crate) mod hand;
 #[cfg(feature = "inverse")]
 pub(crate) mod inverse;
+#[cfg(any(feature = "inverse", feature = "vendor"))]
+#[cfg_attr(not(feature = "vendor"), expect(dead_code, reason = "an Inverse's cut ends its connection"))]
+pub(crate) mod link;
 pub(crate) mod positioned;
 pub(crate) mod record;
 #[cfg(any(feature = "inverse", feature = "vendor"))]
@@ -15,6 +18,9 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
+
+#[cfg(any(feature = "inverse", feature = "vendor"))]
+use crate::control_loop::sync;
 
 /// Force and torque that a device exerts on the hand. Device axes are Bevy's: x right, y up, z
 /// toward the user.
@@ -321,8 +327,8 @@ pub trait Scheduler {
 /// [`Sample::force_on`] as `false` until the motors are enabled again, so that the force returns by
 /// the ramp.
 pub trait StopHandle: Send + Sync {
-    /// Cuts the force by whatever way is left. The call may block, may come at any time and more
-    /// than once, and does nothing to a device that is closed.
+    /// Cuts the force by whatever way is left. The call may come at any time and more than once,
+    /// does nothing to a device that is closed, and may block: each cut has a thread of its own.
     fn cut(&self);
 }
 

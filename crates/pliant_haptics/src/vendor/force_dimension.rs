@@ -14,10 +14,7 @@
 use std::{
     ffi::{c_char, c_int, c_uchar, c_uint},
     path::PathBuf,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, AtomicI32, Ordering},
-    },
+    sync::Arc,
 };
 
 use libloading::Library;
@@ -26,7 +23,10 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 use super::{VendorError, functions, load, text};
 use crate::{
     Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, StopHandle, Wrench,
-    device::renewal::{LAPSE, Renewal},
+    device::{
+        link::{Link, Seen},
+        renewal::{LAPSE, Renewal},
+    },
 };
 
 functions! {
@@ -133,27 +133,19 @@ struct DhdForceSwitch {
     enable: unsafe extern "system" fn(c_uchar, c_char) -> c_int,
     /// Ends the robotic loop of DRD, which may be driving the device.
     stop: Option<unsafe extern "system" fn(bool, c_char) -> c_int>,
-    /// The open device, or a negative number.
-    id: AtomicI32,
-    /// Whether DRD's loop drives the device.
-    driving: AtomicBool,
-    cut: AtomicBool,
+    /// The open device, and whether DRD's loop drives it.
+    link: Link<(c_char, bool)>,
     /// The library stays loaded as long as this value can call it.
     _library: Arc<Library>,
 }
 
 impl StopHandle for DhdForceSwitch {
     fn cut(&self) {
-        self.cut.store(true, Ordering::Release);
-        let Ok(id) = c_char::try_from(self.id.load(Ordering::Acquire)) else { return };
-        if id < 0 {
-            return;
-        }
+        let Some(cut) = self.link.cut() else { return };
+        let (id, driving) = cut.device;
         // SAFETY: all arguments are plain values, and the library is loaded.
         unsafe {
-            if self.driving.load(Ordering::Acquire)
-                && let Some(stop) = self.stop
-            {
+            if let Some(stop) = self.stop.filter(|_| driving) {
                 stop(false, id);
             }
             (self.enable)(0, id);
@@ -188,9 +180,7 @@ impl ForceDimension {
         let switch = Arc::new(DhdForceSwitch {
             enable: api.enable,
             stop: robotic.map(|r| r.stop),
-            id: AtomicI32::new(-1),
-            driving: AtomicBool::new(false),
-            cut: AtomicBool::new(false),
+            link: Link::new(),
             _library: library.clone(),
         });
         let mut device = Self {
@@ -224,7 +214,10 @@ impl ForceDimension {
     fn connect(&mut self) -> Result<(), VendorError> {
         let api = self.api;
         // What was cut was the device before. A cut from here on is the emergency stop.
-        self.switch.cut.store(false, Ordering::Release);
+        if !self.switch.link.begin() {
+            let text = "a call that cut the force has not returned".into();
+            return Err(VendorError::Device { what: "dhdEnableForce", code: 0, text });
+        }
         // SAFETY: arguments and results are plain values. The library owns the strings.
         unsafe {
             let refused = |what| VendorError::Device {
@@ -242,26 +235,25 @@ impl ForceDimension {
             }
             let id = id as c_char;
             self.id = Some(id);
-            self.switch.id.store(id.into(), Ordering::Release);
             (self.renewal, self.off, self.exchanges) = (Renewal::default(), false, 0);
             if let Some(robotic) = &self.robotic
                 && (robotic.supported)(id)
                 && !(robotic.initialized)(id)
             {
-                self.switch.driving.store(true, Ordering::Release);
                 // A cut before the device was open has reached nothing. The supervisor repeats a
                 // cut that comes between this look and the drive.
-                let cut = || self.switch.cut.load(Ordering::Acquire);
-                let found = if cut() { -1 } else { (robotic.auto_init)(id) };
+                let clear = self.switch.link.open((id, true));
+                let found = if clear { (robotic.auto_init)(id) } else { -1 };
                 // The control loop of the library is stopped in any case. The forces stay enabled
                 // for Pliant's own loop.
                 let stopped = (robotic.stop)(true, id);
-                self.switch.driving.store(false, Ordering::Release);
-                if found < 0 || stopped < 0 || cut() {
+                if found < 0 || stopped < 0 || !self.switch.link.open((id, false)) {
                     let error = refused("drdAutoInit");
                     self.disconnect();
                     return Err(error);
                 }
+            } else {
+                self.switch.link.open((id, false));
             }
             let mut serial = 0u16;
             let _ = (api.serial)(&raw mut serial, id);
@@ -298,7 +290,7 @@ impl ForceDimension {
     }
 
     fn disconnect(&mut self) {
-        self.switch.id.store(-1, Ordering::Release);
+        self.switch.link.close();
         if let Some(id) = self.id.take() {
             // SAFETY: this value owns the id and does not use it again.
             unsafe {
@@ -380,26 +372,24 @@ impl ForceDimension {
     }
 
     /// Looks at whether the force is on, and switches it on if it was this program or the watchdog
-    /// that switched it off and `idle` says that no force is sent. What the user has switched off
-    /// at the device stays off.
-    fn look_at_force(&mut self, id: c_char, idle: bool) -> Result<(), Fault> {
+    /// that switched it off and no force is sent: `idle` is what the driver had seen of the cuts
+    /// before. What the user has switched off at the device stays off.
+    fn look_at_force(&mut self, id: c_char, idle: Option<Seen>) -> Result<(), Fault> {
         let status = self.status(id)?;
         if status[STATUS_RESET] == 0 {
             return Err(Fault::NotCalibrated);
         }
         self.off = status[STATUS_FORCE] == 0;
+        let Some(seen) = idle else { return Ok(()) };
         let cause = status[STATUS_FORCE_OFF_CAUSE];
         // Older versions of the library do not tell the cause.
-        let ours = matches!(cause, CAUSE_WATCHDOG | CAUSE_SOFTWARE)
-            || (cause == 0 && self.switch.cut.load(Ordering::Acquire));
-        if self.off && idle && ours {
+        let ours = matches!(cause, CAUSE_WATCHDOG | CAUSE_SOFTWARE) || (cause == 0 && seen.cut);
+        if self.off && ours {
             // The force counts as off until the next look.
             // SAFETY: all arguments are plain values.
             self.check(unsafe { (self.api.enable)(1, id) })?;
         }
-        if idle {
-            self.switch.cut.store(false, Ordering::Release);
-        }
+        self.switch.link.answer(seen);
         Ok(())
     }
 }
@@ -430,18 +420,19 @@ impl HapticDevice for ForceDimension {
             return Err(Fault::Gone);
         };
         // A force that is switched on again must begin at zero, whoever switches it on.
-        let idle = self.off || self.renewal.has_lapsed() || self.switch.cut.load(Ordering::Acquire);
+        let seen = self.switch.link.seen();
+        let idle = self.off || self.renewal.has_lapsed() || seen.cut;
         let wrench = if idle { &Wrench::ZERO } else { wrench };
         let [fx, fy, fz] = to_device(wrench.force);
         let [tx, ty, tz] = to_device(wrench.torque);
         // SAFETY: all arguments are plain values.
         let set = unsafe { (self.api.wrench)(fx, fy, fz, tx, ty, tz, id) };
         // A call that itself took too long has lost its force as well.
-        let late = self.renewal.renew() || self.switch.cut.load(Ordering::Acquire);
+        let late = self.renewal.renew() || self.switch.link.seen().cut;
         scheduler.wait();
         let sent = self.check(set);
         if idle || late || sent.is_err() || self.exchanges.is_multiple_of(STATUS_EVERY) {
-            self.look_at_force(id, idle)?;
+            self.look_at_force(id, idle.then_some(seen))?;
         }
         if !self.off {
             // A force that is refused because it is switched off at the device is no error.

@@ -7,7 +7,8 @@
 //!
 //! HDAPI takes work for its servo thread from any thread, so the supervisor schedules a callback
 //! that sends no force and switches the force output off. If the servo does not run it in 10 ms,
-//! the supervisor stops the scheduler. HDAPI has no call that sets the time of the hardware's own
+//! the supervisor stops the scheduler. It makes both calls on threads of their own, because each of
+//! them may hang as well. HDAPI has no call that sets the time of the hardware's own
 //! watchdog. The maker's example `ErrorHandling` says that the hardware "needs frequent updates to
 //! stay alive"; how long it waits is not published.
 //!
@@ -16,23 +17,25 @@
 //! an unsigned char; `HDulong` is `unsigned long`, of 8 bytes on Linux and 4 on Windows.
 
 mod info;
+mod scheduler;
 mod servo;
 
 use std::ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void};
 use std::mem::ManuallyDrop;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
 use crate::{
     Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Scheduler, StopHandle, Wrench,
-    device::renewal::Renewal,
+    control_loop::sync,
+    device::{link::Link, renewal::Renewal},
 };
 use info::{describe, read_info};
-use servo::{HdForceSwitch, HdStop, PRIORITY, SCHEDULER, ScheduledFrame, servo};
+use servo::{HdForceSwitch, HdStop, PRIORITY, SCHEDULER, ScheduledFrame, servo, soon, turn_to_open};
 
 /// Handle of a device.
 type Handle = c_uint;
@@ -166,8 +169,8 @@ pub struct OpenHaptics {
     /// Whether the switch has ever been seen closed. What an open one means before is not known.
     was_held: bool,
     frame: ManuallyDrop<Box<ScheduledFrame>>,
-    /// Whether the scheduler did not run the last frame. The frame is its own until the scheduler
-    /// has been stopped and the device opened again.
+    /// Whether the scheduler did not run the last frame. The frame is its own from then on, because
+    /// it may run it at any time, and the device gets another one when it is opened again.
     dead: bool,
 }
 
@@ -185,38 +188,21 @@ impl OpenHaptics {
         let api = OpenHapticsApi::from(&library, &path)?;
         let switch = Arc::new(HdForceSwitch {
             api,
-            handle: AtomicU32::new(INVALID),
-            cut: AtomicBool::new(false),
-            obeyed: AtomicBool::new(false),
+            link: Link::new(),
+            posting: AtomicBool::new(false),
             _library: Arc::new(library),
         });
-        let frame = ScheduledFrame {
-            switch: switch.clone(),
-            device: INVALID,
-            force: [0.0; 3],
-            idle: true,
-            leave: false,
-            held: None,
-            was_held: false,
-            ran: false,
-            force_on: false,
-            position: [0.0; 3],
-            velocity: [0.0; 3],
-            transform: [0.0; 16],
-            buttons: 0,
-            error: ErrorInfo::default(),
-        };
         let mut device = Self {
             api,
             handle: None,
             info: describe(&config),
             config,
+            frame: ManuallyDrop::new(ScheduledFrame::new(switch.clone())),
             switch,
             renewal: Renewal::default(),
             late: false,
             held: None,
             was_held: false,
-            frame: ManuallyDrop::new(Box::new(frame)),
             dead: false,
         };
         device.connect()?;
@@ -233,60 +219,75 @@ impl OpenHaptics {
             VendorError::Device { what: "the device's name", code: 0, text: "has a zero in it".into() }
         })?;
         let api = self.api;
-        let mut scheduler = SCHEDULER.lock().unwrap_or_else(PoisonError::into_inner);
+        let refused = |what, code: c_uint, text: &str| VendorError::Device {
+            what,
+            code: code.into(),
+            text: text.into(),
+        };
+        const BUSY: &str = "another thread opens or closes a device, or cuts its force, and hangs";
+        let _turn = turn_to_open().ok_or_else(|| refused("hdInitDevice", 0, BUSY))?;
+        if !self.switch.link.begin() {
+            return Err(refused("hdDisable", 0, BUSY));
+        }
         // SAFETY: the name is a C string, or null for the default device. The rest follows the
         // order of the vendor's examples.
-        unsafe {
+        let handle = unsafe {
             let handle = (api.init)(name.as_ref().map_or(std::ptr::null(), |n| n.as_ptr()));
             let error = api.drain();
             if handle == INVALID || error.code != 0 {
-                return Err(VendorError::Device {
-                    what: "hdInitDevice",
-                    code: error.code.into(),
-                    text: String::new(),
-                });
+                return Err(refused("hdInitDevice", error.code, ""));
             }
             (api.make_current)(handle);
-            self.handle = Some(handle);
             self.info = read_info(&api, &self.config);
             (api.enable)(FORCE_OUTPUT);
-            if !scheduler.running {
+            let error = api.drain();
+            if error.code != 0 {
+                (api.close)(handle);
+                return Err(refused("hdEnable", error.code, ""));
+            }
+            handle
+        };
+        let start = || {
+            // SAFETY: all arguments are plain values.
+            let error = unsafe {
                 (api.set_rate)(self.config.rate.clamp(100.0, 8000.0) as c_ulong);
                 // A rate that the device does not support is an error that keeps the old rate.
                 let _ = api.drain();
                 (api.start)();
-            }
-            let error = api.drain();
-            if error.code != 0 {
-                (api.close)(handle);
-                self.handle = None;
-                let (what, code) = ("hdStartScheduler", error.code.into());
-                return Err(VendorError::Device { what, code, text: String::new() });
-            }
-            self.switch.handle.store(handle, Ordering::Release);
+                api.drain()
+            };
+            if error.code == 0 { Ok(()) } else { Err(refused("hdStartScheduler", error.code, "")) }
+        };
+        let started = soon(|| SCHEDULER.enter(start));
+        if let Err(error) = started.unwrap_or_else(|| Err(refused("hdStartScheduler", 0, BUSY))) {
+            // SAFETY: nobody uses the handle after this.
+            unsafe { (api.close)(handle) };
+            return Err(error);
         }
-        (self.renewal, self.late, self.held, self.dead) = (Renewal::default(), false, None, false);
-        scheduler.running = true;
-        scheduler.open += 1;
+        self.handle = Some(handle);
+        if std::mem::take(&mut self.dead) {
+            // The scheduler may still run the frame before, which is never freed.
+            self.frame = ManuallyDrop::new(ScheduledFrame::new(self.switch.clone()));
+        }
+        (self.renewal, self.late, self.held) = (Renewal::default(), false, None);
+        self.switch.link.open(handle);
         Ok(())
     }
 
     fn disconnect(&mut self) {
         let Some(handle) = self.handle else { return };
         let left = !matches!(self.frame([0.0; 3], true), Err(Fault::NotRun));
-        self.switch.handle.store(INVALID, Ordering::Release);
+        self.switch.link.close();
         self.handle = None;
-        let mut scheduler = SCHEDULER.lock().unwrap_or_else(PoisonError::into_inner);
-        scheduler.open = scheduler.open.saturating_sub(1);
+        // A device is closed in any case, also if another one hangs.
+        let _turn = turn_to_open();
         // SAFETY: this value owns the handle and does not use it again.
         unsafe {
             if !left {
                 (self.api.make_current)(handle);
                 (self.api.disable)(FORCE_OUTPUT);
             }
-            if scheduler.open == 0 && std::mem::take(&mut scheduler.running) {
-                (self.api.stop)();
-            }
+            SCHEDULER.leave(|| (self.api.stop)());
             (self.api.close)(handle);
             let _ = self.api.drain();
         }
@@ -302,13 +303,18 @@ impl OpenHaptics {
         (frame.device, frame.force, frame.leave) = (device, force, leave);
         frame.idle = leave || self.late || self.renewal.has_lapsed();
         (frame.held, frame.was_held) = (self.held, self.was_held);
-        (frame.ran, frame.force_on, frame.buttons) = (false, false, 0);
+        (frame.force_on, frame.buttons) = (false, 0);
         (frame.position, frame.velocity, frame.transform) = ([f64::NAN; 3], [0.0; 3], [0.0; 16]);
         frame.error = ErrorInfo::default();
+        frame.turn.ask();
+        let frame = &raw mut *frame;
         // SAFETY: the call returns after the callback or without it. In the second case the frame
-        // is not touched again until the scheduler was stopped, and it is never freed.
-        unsafe { (self.api.run)(servo, (&raw mut *frame).cast(), PRIORITY) };
-        if !frame.ran {
+        // is given up: it is not touched again, and never freed.
+        let ran = unsafe {
+            (self.api.run)(servo, frame.cast(), PRIORITY);
+            (*frame).turn.take()
+        };
+        if !ran {
             // The call has returned without having run the callback, and maybe without an error.
             // The motors still have the last force.
             self.dead = true;
@@ -317,6 +323,7 @@ impl OpenHaptics {
             HdStop(self.switch.clone()).cut();
             return Err(Fault::NotRun);
         }
+        let frame = &**self.frame;
         self.held = frame.held;
         self.was_held |= frame.held == Some(true);
         self.late = self.renewal.renew();

@@ -19,7 +19,7 @@ struct state {
     double position[3], velocity[3], transform[16], force[3], pending[3], frame_at, patience;
     int made, buttons, open, current, running, in_frame, force_on, calibration, styles, switch_, has_switch;
     unsigned int errors[64], each_frame, first_error;
-    int depth, error_count, servo, hung, disabled, stops;
+    int depth, error_count, servo, hung, disabled, stops, init_hangs, stop_hangs, in_init, in_stop;
     unsigned long rate;
     long frames, forces;
     double felt, rise;
@@ -31,7 +31,7 @@ static const char *version = "3.4.0";
 static struct { HDSchedulerCallback call; void *data; } waiting[64];
 static volatile int waits;
 
-enum { ALIVE, DEAD, STUCK, LOST_CALL };
+enum { ALIVE, DEAD, STUCK, LOST_CALL, LOCKED, LATE };
 
 /* With STATE, two processes that load this library see one device. */
 __attribute__((constructor)) static void make(void) {
@@ -55,6 +55,16 @@ static double now(void) {
     clock_gettime(CLOCK_MONOTONIC, &t);
     return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
+/* Hangs while `on`, and says so in `in`. */
+static void hang(volatile int *on, volatile int *in) {
+    while (*on) { *in = 1; usleep(100); }
+    *in = 0;
+}
+static void keep(HDSchedulerCallback call, void *data) {
+    if (waits >= 64) return;
+    waiting[waits].call = call;
+    waiting[waits++].data = data;
+}
 /* Errors are a stack: the newest comes out first. */
 static void fail(unsigned int code) { if (s.depth < 64) s.errors[s.depth++] = code; }
 
@@ -72,6 +82,7 @@ static void feel(void) {
 }
 
 HHD hdInitDevice(const char *name) {
+    hang(&s.init_hangs, &s.in_init);
     if (name && strcmp(name, "Left Device")) { fail(0x300); return 0xFFFFFFFFu; }
     if (s.open) { fail(0x301); return 0xFFFFFFFFu; }
     s.open = 1;
@@ -158,6 +169,7 @@ void hdUpdateCalibration(unsigned int style) {
 }
 void hdStartScheduler(void) { if (s.running) fail(0x102); s.running = 1; }
 void hdStopScheduler(void) {
+    hang(&s.stop_hangs, &s.in_stop);
     if (!s.running) fail(0x102);
     s.running = 0;
     s.stops++;
@@ -169,7 +181,8 @@ void hdScheduleSynchronous(HDSchedulerCallback call, void *data, unsigned short 
     (void)priority;
     if (!s.running) { fail(0x102); return; }
     if (s.servo == DEAD) return; /* it never runs, and nobody says so */
-    while (s.servo == STUCK || s.servo == LOST_CALL) { s.hung = 1; usleep(100); }
+    if (s.servo == LATE) { keep(call, data); return; } /* it runs late, and nobody says so */
+    while (s.servo == STUCK || s.servo == LOST_CALL || s.servo == LOCKED) { s.hung = 1; usleep(100); }
     s.hung = 0;
     call(data);
 }
@@ -178,12 +191,12 @@ void hdScheduleSynchronous(HDSchedulerCallback call, void *data, unsigned short 
 unsigned long hdScheduleAsynchronous(HDSchedulerCallback call, void *data, unsigned short priority) {
     (void)priority;
     if (!s.running) { fail(0x102); return 0; }
+    while (s.servo == LOCKED) usleep(100); /* a lock of the library that the stuck call holds */
     if (s.servo == ALIVE || s.servo == LOST_CALL) {
         s.in_frame = 0;
         call(data);
-    } else if (waits < 64) {
-        waiting[waits].call = call;
-        waiting[waits++].data = data;
+    } else {
+        keep(call, data);
     }
     return 1;
 }
@@ -209,14 +222,26 @@ void fake_version(const char *v) { version = v; }
 void fake_safety_switch(int on) { s.has_switch = on >= 0; s.switch_ = on > 0; feel(); }
 /* The largest rise of the force since the last look, N. */
 double fake_rise(void) { double r = s.rise; s.rise = 0; return r; }
-/* 0: alive, 1: dead, 2: stuck with all that it should run, 3: stuck in the caller's call only. */
-void fake_servo(int mode) {
-    s.servo = mode;
-    while (mode == ALIVE && waits > 0) {
+/* Runs what waits since the servo was dead, stuck or late. */
+void fake_run_waiting(void) {
+    while (waits > 0) {
         waits--;
+        s.in_frame = 0;
         waiting[waits].call(waiting[waits].data);
     }
 }
+/* 0: alive, 1: dead, 2: stuck with all that it should run, 3: stuck in the caller's call only,
+   4: stuck in every call that schedules something, 5: runs what it is given late. */
+void fake_servo(int mode) {
+    s.servo = mode;
+    if (mode == ALIVE) fake_run_waiting();
+}
+/* The servo lives again, and has not run yet what waits. */
+void fake_revive(void) { s.servo = ALIVE; }
+void fake_init_hangs(int on) { s.init_hangs = on; }
+int fake_in_init(void) { return s.in_init; }
+void fake_stop_hangs(int on) { s.stop_hangs = on; }
+int fake_in_stop(void) { return s.in_stop; }
 int fake_hung(void) { return s.hung; }
 /* Time after which the hardware switches the force off, s; 0: never. */
 void fake_hardware_watchdog(double seconds) { s.patience = seconds; }

@@ -1,17 +1,19 @@
 //! What runs on the library's servo thread: the frames of the loop, and the supervisor's cut.
 
 use std::ffi::{c_int, c_uchar, c_uint, c_ushort, c_void};
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, TryLockError};
 use std::time::{Duration, Instant};
 
 use libloading::Library;
 
+use super::scheduler::{SharedScheduler, Turn};
 use super::{
     CURRENT_BUTTONS, CURRENT_FORCE, CURRENT_POSITION, CURRENT_SAFETY_SWITCH, CURRENT_TRANSFORM,
     CURRENT_VELOCITY, ErrorInfo, FORCE_OUTPUT, Handle, INVALID, OpenHapticsApi,
 };
-use crate::StopHandle;
+use crate::control_loop::supervisor::beside;
+use crate::{StopHandle, device::link::Link};
 
 pub(super) const PRIORITY: c_ushort = u16::MAX / 2;
 
@@ -19,50 +21,82 @@ const MAX_PRIORITY: c_ushort = u16::MAX;
 
 const CALLBACK_DONE: c_uint = 0;
 
-/// Time that the servo thread has to run the supervisor's callback.
+/// Time that the servo thread has to run the supervisor's callback, and the library to stop it.
 const SERVO_PATIENCE: Duration = Duration::from_millis(10);
+/// Time that a thread waits for another one that opens or closes a device.
+const OPEN_PATIENCE: Duration = Duration::from_secs(1);
 
-/// The library's scheduler, of which a process has one.
-pub(super) struct ServoScheduler {
-    /// Number of open devices. The scheduler starts with the first device and stops with the last.
-    pub(super) open: usize,
-    pub(super) running: bool,
+pub(super) static SCHEDULER: LazyLock<SharedScheduler> = LazyLock::new(SharedScheduler::default);
+
+/// Held while a device is opened or closed, which the library does for one at a time. No cut waits
+/// for it.
+static OPENING: Mutex<()> = Mutex::new(());
+
+/// Tries every half millisecond, for as long as `patience`.
+fn within<T>(patience: Duration, mut attempt: impl FnMut() -> Option<T>) -> Option<T> {
+    let begun = Instant::now();
+    loop {
+        let result = attempt();
+        if result.is_some() || begun.elapsed() >= patience {
+            return result;
+        }
+        std::thread::sleep(Duration::from_micros(500));
+    }
 }
 
-pub(super) static SCHEDULER: Mutex<ServoScheduler> = Mutex::new(ServoScheduler { open: 0, running: false });
+/// Tries for as long as a thread waits for another device.
+pub(super) fn soon<T>(attempt: impl FnMut() -> Option<T>) -> Option<T> {
+    within(OPEN_PATIENCE, attempt)
+}
+
+/// Waits until no other thread opens or closes a device, but not for one that hangs.
+pub(super) fn turn_to_open() -> Option<MutexGuard<'static, ()>> {
+    soon(|| match OPENING.try_lock() {
+        Ok(turn) => Some(turn),
+        Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+        Err(TryLockError::WouldBlock) => None,
+    })
+}
 
 /// Switches the force off from another thread.
 pub(super) struct HdForceSwitch {
     pub(super) api: OpenHapticsApi,
-    /// The open device, or [`INVALID`].
-    pub(super) handle: AtomicU32,
-    pub(super) cut: AtomicBool,
-    /// Whether the servo thread has run the last cut.
-    pub(super) obeyed: AtomicBool,
+    pub(super) link: Link<Handle>,
+    /// Whether a thread is scheduling a cut, and may hang there.
+    pub(super) posting: AtomicBool,
     /// The library stays loaded as long as this value can call it.
     pub(super) _library: Arc<Library>,
+}
+
+/// A cut that the servo thread is to make.
+struct CutOrder {
+    switch: Arc<HdForceSwitch>,
+    /// The connection that it is for.
+    number: u64,
+    /// Whether the servo thread has run it.
+    obeyed: AtomicBool,
 }
 
 /// Sends no force and switches the force output off, on the servo thread.
 ///
 /// # Safety
-/// `data` is one count of an `Arc<HdForceSwitch>`, which this function takes over.
+/// `data` is one count of an `Arc<CutOrder>`, which this function takes over.
 unsafe extern "system" fn cut_force(data: *mut c_void) -> c_uint {
     // SAFETY: the caller passes the count over.
-    let switch = unsafe { Arc::from_raw(data.cast_const().cast::<HdForceSwitch>()) };
-    let device = switch.handle.load(Ordering::Acquire);
-    if device != INVALID {
-        let api = switch.api;
+    let order = unsafe { Arc::from_raw(data.cast_const().cast::<CutOrder>()) };
+    // A scheduler that was stuck may run it late, when the device has been opened again.
+    if let Some(cut) = order.switch.link.act(order.number) {
+        let api = order.switch.api;
         // SAFETY: as in `servo`.
         unsafe {
-            (api.begin)(device);
+            (api.begin)(cut.device);
             (api.set_double)(CURRENT_FORCE, [0.0f64; 3].as_ptr());
-            (api.end)(device);
+            (api.end)(cut.device);
             (api.disable)(FORCE_OUTPUT);
             let _ = api.drain();
         }
     }
-    switch.obeyed.store(true, Ordering::Release);
+    order.obeyed.store(true, Ordering::Release);
     CALLBACK_DONE
 }
 
@@ -72,28 +106,27 @@ pub(super) struct HdStop(pub(super) Arc<HdForceSwitch>);
 impl StopHandle for HdStop {
     fn cut(&self) {
         let switch = &self.0;
-        switch.cut.store(true, Ordering::Release);
-        if switch.handle.load(Ordering::Acquire) == INVALID {
-            return;
+        // The servo thread acts on the device, later.
+        let Some(number) = switch.link.cut().map(|cut| cut.number) else { return };
+        let order = Arc::new(CutOrder { switch: switch.clone(), number, obeyed: AtomicBool::new(false) });
+        if !switch.posting.swap(true, Ordering::AcqRel) {
+            let order = order.clone();
+            beside(move || {
+                let switch = &order.switch;
+                let data = Arc::into_raw(order.clone()).cast_mut().cast();
+                // SAFETY: the callback takes over the count. A scheduler that never runs it leaves
+                // the few bytes of one count behind.
+                unsafe { (switch.api.post)(cut_force, data, MAX_PRIORITY) };
+                switch.posting.store(false, Ordering::Release);
+            });
         }
-        switch.obeyed.store(false, Ordering::Release);
-        let data = Arc::into_raw(switch.clone()).cast_mut().cast();
-        // SAFETY: the callback takes over the count. A scheduler that never runs it leaves the few
-        // bytes of one count behind.
-        unsafe { (switch.api.post)(cut_force, data, MAX_PRIORITY) };
-        let posted = Instant::now();
-        while !switch.obeyed.load(Ordering::Acquire) {
-            if posted.elapsed() >= SERVO_PATIENCE {
-                // The servo is dead or stuck, and with it every device of this process. A thread
-                // that holds the lock hangs in a call of the library itself.
-                let was_running = SCHEDULER.try_lock().is_ok_and(|mut s| std::mem::take(&mut s.running));
-                if was_running {
-                    // SAFETY: the function takes nothing.
-                    unsafe { (switch.api.stop)() };
-                }
-                return;
-            }
-            std::thread::sleep(Duration::from_micros(500));
+        let is_obeyed = || order.obeyed.load(Ordering::Acquire).then_some(());
+        if within(SERVO_PATIENCE, is_obeyed).is_none() {
+            // The servo is dead or stuck, and with it every device of this process.
+            let switch = switch.clone();
+            // SAFETY: the function takes nothing.
+            let stop = beside(move || SCHEDULER.stop(|| unsafe { (switch.api.stop)() }));
+            within(SERVO_PATIENCE, || stop.as_ref().is_none_or(|s| s.is_finished()).then_some(()));
         }
     }
 }
@@ -112,8 +145,8 @@ pub(super) struct ScheduledFrame {
     pub(super) held: Option<bool>,
     /// Whether an open safety switch means that the force is off.
     pub(super) was_held: bool,
-    /// Whether the callback has run at all.
-    pub(super) ran: bool,
+    /// Whether the servo thread may touch the rest.
+    pub(super) turn: Turn,
     /// Whether the force was sent as it was given.
     pub(super) force_on: bool,
     pub(super) position: [f64; 3],
@@ -124,15 +157,42 @@ pub(super) struct ScheduledFrame {
     pub(super) error: ErrorInfo,
 }
 
-/// Runs one frame on the library's servo thread: writes the force and reads the state.
+impl ScheduledFrame {
+    pub(super) fn new(switch: Arc<HdForceSwitch>) -> Box<Self> {
+        Box::new(Self {
+            switch,
+            device: INVALID,
+            force: [0.0; 3],
+            idle: true,
+            leave: false,
+            held: None,
+            was_held: false,
+            turn: Turn::default(),
+            force_on: false,
+            position: [0.0; 3],
+            velocity: [0.0; 3],
+            transform: [0.0; 16],
+            buttons: 0,
+            error: ErrorInfo::default(),
+        })
+    }
+}
+
+/// Runs one frame on the library's servo thread: writes the force and reads the state. A frame that
+/// was given up does nothing.
 ///
 /// # Safety
-/// `data` is a `ScheduledFrame` that nothing else accesses until this function has returned.
+/// `data` is a `ScheduledFrame` that is never freed before it has run or without its turn.
 pub(super) unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
-    // SAFETY: `OpenHaptics::frame` passes its own frame and waits.
-    let frame = unsafe { &mut *data.cast::<ScheduledFrame>() };
+    let data = data.cast::<ScheduledFrame>();
+    // SAFETY: the frame is there, and the turn is made for two threads.
+    let turn = unsafe { &(*data).turn };
+    if !turn.begin() {
+        return CALLBACK_DONE;
+    }
+    // SAFETY: it is this thread's turn, until it ends.
+    let frame = unsafe { &mut *data };
     let api = frame.switch.api;
-    frame.ran = true;
     // SAFETY: the calls and the lengths of their arrays are those of the header, and the calls lie
     // between begin and end, as the header requires. The frame makes its device the current one.
     unsafe {
@@ -145,9 +205,9 @@ pub(super) unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
         let taken = held == Some(true) && frame.held == Some(false);
         let released = held == Some(false) && frame.was_held;
         frame.held = held;
-        let cut = frame.switch.cut.load(Ordering::Acquire);
+        let seen = frame.switch.link.seen();
         let enabled = (api.is_enabled)(FORCE_OUTPUT) != 0;
-        frame.force_on = !(frame.idle || cut || !enabled || taken || released);
+        frame.force_on = !(frame.idle || seen.cut || !enabled || taken || released);
         let force = if frame.force_on { frame.force } else { [0.0; 3] };
         (api.set_double)(CURRENT_FORCE, force.as_ptr());
         (api.get_double)(CURRENT_POSITION, frame.position.as_mut_ptr());
@@ -159,11 +219,12 @@ pub(super) unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
         frame.error = if error.code == 0 { later } else { error };
         if frame.leave {
             (api.disable)(FORCE_OUTPUT);
-        } else if (cut || !enabled) && frame.error.code == 0 {
+        } else if (seen.cut || !enabled) && frame.error.code == 0 {
             // The supervisor or the library has switched the force off. It comes back at zero.
             (api.enable)(FORCE_OUTPUT);
-            frame.switch.cut.store(false, Ordering::Release);
+            frame.switch.link.answer(seen);
         }
     }
+    frame.turn.end();
     CALLBACK_DONE
 }
