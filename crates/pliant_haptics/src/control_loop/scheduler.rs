@@ -3,7 +3,8 @@
 
 use crate::{Period, Scheduler};
 
-/// Monotonic clock in seconds since its creation. All copies agree.
+/// Monotonic clock in seconds since its creation. All copies agree. On Linux and Android it counts
+/// on while the machine is suspended, so that a wake-up ends a long period.
 #[derive(Debug, Clone, Copy)]
 pub struct LoopClock {
     origin: imp::Stamp,
@@ -126,8 +127,27 @@ mod imp {
 
     pub(super) type Stamp = Timespec;
 
+    /// `CLOCK_MONOTONIC` of Linux does not count the time for which the machine is suspended.
+    #[cfg(any(target_os = "linux", target_os = "android"))]
+    const CLOCK: ClockId = ClockId::Boottime;
+    #[cfg(target_os = "freebsd")]
+    const CLOCK: ClockId = ClockId::Monotonic;
+
+    /// The seconds for which a test pretends that the machine was suspended, as the clock counts
+    /// them.
+    #[cfg(all(test, any(target_os = "linux", target_os = "android")))]
+    fn suspended() -> i64 {
+        if CLOCK == ClockId::Boottime { super::SUSPENDED.get() } else { 0 }
+    }
+    #[cfg(not(all(test, any(target_os = "linux", target_os = "android"))))]
+    const fn suspended() -> i64 {
+        0
+    }
+
     pub(super) fn now() -> Stamp {
-        clock_gettime(ClockId::Monotonic)
+        let mut now = clock_gettime(CLOCK);
+        now.tv_sec += suspended();
+        now
     }
 
     pub(super) fn since(origin: Stamp) -> f64 {
@@ -138,14 +158,14 @@ mod imp {
     pub(super) fn sleep_until(origin: Stamp, seconds: f64) {
         let whole = seconds.floor();
         let mut at = origin;
-        at.tv_sec += whole as i64;
+        at.tv_sec += whole as i64 - suspended();
         at.tv_nsec += ((seconds - whole) * 1e9) as i64;
         if at.tv_nsec >= 1_000_000_000 {
             at.tv_nsec -= 1_000_000_000;
             at.tv_sec += 1;
         }
         // A signal ends the sleep early. With an absolute time, the call can simply be repeated.
-        while clock_nanosleep_absolute(ClockId::Monotonic, &at) == Err(Errno::INTR) {}
+        while clock_nanosleep_absolute(CLOCK, &at) == Err(Errno::INTR) {}
     }
 }
 
@@ -178,6 +198,19 @@ mod imp {
             std::hint::spin_loop();
         }
     }
+}
+
+#[cfg(all(test, any(target_os = "linux", target_os = "android")))]
+thread_local! {
+    /// Seconds for which this thread's machine was suspended.
+    static SUSPENDED: std::cell::Cell<i64> = const { std::cell::Cell::new(0) };
+}
+
+/// Pretends that the machine was suspended for so long. Among the kernel's clocks, `CLOCK_BOOTTIME`
+/// counts it and `CLOCK_MONOTONIC` does not.
+#[cfg(all(test, any(target_os = "linux", target_os = "android")))]
+pub(crate) fn suspend(seconds: i64) {
+    SUSPENDED.set(SUSPENDED.get() + seconds);
 }
 
 #[cfg(test)]
@@ -213,5 +246,67 @@ mod tests {
         assert_eq!((long.late, long.missed), (0.1, 50));
         assert!((long.dt - 0.102).abs() < 1e-12 && long.now == long.dt);
         assert_eq!(scheduler.wait().dt, 0.002);
+    }
+    /// A hand that is held away from the center, and that a suspended machine finds further away.
+    #[cfg(any(target_os = "linux", target_os = "android"))]
+    struct Held(std::sync::Arc<std::sync::Mutex<f64>>);
+
+    #[cfg(any(target_os = "linux", target_os = "android"))]
+    impl crate::HapticDevice for Held {
+        fn info(&self) -> crate::DeviceInfo {
+            crate::VirtualConfig::touch().info()
+        }
+        fn exchange(
+            &mut self,
+            _: &crate::Wrench,
+            scheduler: &mut dyn Scheduler,
+        ) -> Result<crate::Sample, crate::Fault> {
+            scheduler.wait();
+            Ok(crate::Sample::at([*self.0.lock().unwrap(), 0.0, 0.0]))
+        }
+        fn safe_stop(&mut self) {}
+    }
+
+    #[cfg(any(target_os = "linux", target_os = "android"))]
+    #[test]
+    fn a_machine_that_wakes_up_from_a_suspend_ramps() {
+        use crate::{Cycle, Fault, LocalModel, LoopConfig};
+        let hand = std::sync::Arc::new(std::sync::Mutex::new(0.005));
+        let mut cycle = Cycle::new(Held(hand.clone()), LoopConfig::default()).unwrap();
+        let mut scheduler = RealScheduler::new(LoopClock::start(), 1000.0);
+        let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
+        model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
+        // A real clock is late on a busy machine, which lets the ramp wait.
+        let mut until = |what: &str, look: &mut dyn FnMut(f64, Option<Fault>) -> bool| {
+            let reached = (0..60_000).any(|_| {
+                model.tick += 1;
+                let tick = cycle.step(&mut scheduler, &model, &mut ()).tick;
+                look(-tick.wrench.force[0], tick.fault)
+            });
+            assert!(reached, "never: {what}");
+        };
+        let mut before = 0.0;
+        until("1 N before", &mut |force, _| {
+            before = force;
+            force > 0.999
+        });
+        suspend(600);
+        *hand.lock().unwrap() = 0.006;
+        let (mut last, mut rise, mut first, mut faded) = (before, 0.0f64, None, false);
+        until("1.2 N after", &mut |force, fault| {
+            rise = rise.max(force - last);
+            first.get_or_insert((force, fault));
+            faded |= force == 0.0;
+            last = force;
+            force > 1.19
+        });
+        println!("{before:.3} N, then {first:?}; it rises by at most {rise:.4} N a period");
+        assert!(
+            first.is_some_and(
+                |(f, fault)| f <= before && matches!(fault, Some(Fault::Stalled(t)) if t > 599.0)
+            )
+        );
+        // The ramp brings the peak force of 3.3 N in 0.3 s, and at most two periods at once.
+        assert!(faded && rise < 3.3 / 0.3 * 2e-3 * 1.000_001, "{faded}, {rise} N");
     }
 }
