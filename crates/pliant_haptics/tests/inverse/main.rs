@@ -288,28 +288,90 @@ fn a_service_that_does_not_answer_loses_its_force() {
 #[ignore = "is run by another test, in a process of its own"]
 fn a_game() {
     let Ok(address) = std::env::var("PLIANT_TEST_SERVICE") else { return };
+    let [end, seen] =
+        ["PLIANT_TEST_END", "PLIANT_TEST_SEEN"].map(|name| std::env::var(name).unwrap_or_default());
     let mut game = Game::start(second(InverseConfig { address, timeout: 10.0, ..InverseConfig::default() }));
-    loop {
+    while !std::path::Path::new(&seen).exists() {
         game.publish();
+    }
+    match end.as_str() {
+        "panic" => panic!("the game's own bug, on purpose"),
+        "exit" => std::process::exit(0),
+        _ => std::process::abort(),
     }
 }
 
 #[test]
 fn a_process_that_dies() {
+    for end in ["KILL", "panic", "exit", "abort"] {
+        let service = Service::start(true);
+        service.desk().position = [0.005, 0.0, 0.0];
+        let seen = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("inverse_{end}.seen"));
+        let _ = std::fs::remove_file(&seen);
+        let mut child = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "a_game", "--ignored", "--nocapture"])
+            .env("PLIANT_TEST_SERVICE", &service.address)
+            .env("PLIANT_TEST_END", end)
+            .env("PLIANT_TEST_SEEN", &seen)
+            // A backtrace takes a quarter of a second before the unwinding begins.
+            .env("RUST_BACKTRACE", "0")
+            .stdout(std::process::Stdio::null())
+            .stderr(std::process::Stdio::null())
+            .spawn()
+            .unwrap();
+        pulled(&service, || std::thread::sleep(Duration::from_millis(1)));
+        let begun = if end == "KILL" {
+            child.kill().unwrap();
+            Instant::now()
+        } else {
+            std::fs::write(&seen, "").unwrap();
+            let written = Instant::now();
+            // The game ends up to one of its rounds later. The time below counts from its end.
+            if end == "panic" {
+                written
+            } else {
+                child.wait().unwrap();
+                Instant::now()
+            }
+        };
+        while service.desk().ended == 0 && begun.elapsed().as_secs_f64() < 5.0 {
+            std::thread::sleep(Duration::from_micros(200));
+        }
+        let took = begun.elapsed().as_secs_f64();
+        child.wait().unwrap();
+        let last = service.desk().forces.last().map(|f| f.map(f64::abs).iter().sum::<f64>());
+        println!("Inverse, {end}: closed after {:.1} ms, {last:?} N was sent last", 1e3 * took);
+        // The system closes the connection. That a real service then lets go of the force is
+        // assumed, and only a panic that unwinds says so by its last command.
+        assert!(took < 0.2, "{end}: {took} s");
+        assert!(end != "panic" || last == Some(0.0), "{end}: {last:?}");
+        assert_eq!(service.desk().refused, [""; 0], "{end}: no command was sent in part");
+    }
+}
+
+#[test]
+fn a_cut_while_the_device_is_opened_again_sends_no_force() {
     let service = Service::start(true);
-    service.desk().position = [0.005, 0.0, 0.0];
-    let mut child = std::process::Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "a_game", "--ignored"])
-        .env("PLIANT_TEST_SERVICE", &service.address)
-        .stdout(std::process::Stdio::null())
-        .stderr(std::process::Stdio::null())
-        .spawn()
-        .unwrap();
-    pulled(&service, || std::thread::sleep(Duration::from_millis(1)));
-    child.kill().unwrap();
-    child.wait().unwrap();
-    // The system closes the connection. That a real service then lets go of the force is assumed.
-    let took = seconds_to_zero(&service);
-    println!("Inverse, KILL: connection closed after {:.1} ms", 1e3 * took);
-    assert!(took < 0.2, "{took} s");
+    let mut device = Inverse::open(second(service.config())).unwrap();
+    let pull = Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO };
+    assert!(device.exchange(&Wrench::ZERO, &mut pacing()).is_ok());
+    let stop = device.stop_handle().unwrap();
+    service.desk().unfriendly = true;
+    let opening = std::thread::spawn(move || {
+        let opened = device.reopen();
+        (opened, opened.is_ok() && device.exchange(&pull, &mut pacing()).is_ok(), device)
+    });
+    machine::until("it is being opened", || {
+        std::thread::sleep(Duration::from_millis(1));
+        if service.desk().waits { Ok(()) } else { Err("nobody has connected") }
+    });
+    // The emergency stop, for example.
+    stop.cut();
+    service.desk().unfriendly = false;
+    let (opened, sent, mut device) = opening.join().unwrap();
+    let motor = service.desk().motor;
+    println!("Inverse, cut while it is opened again: {opened:?}, {motor} N");
+    assert_eq!((opened, sent, motor), (Err(Fault::Gone), false, 0.0));
+    device.reopen().unwrap();
+    assert!(device.exchange(&pull, &mut pacing()).is_ok(), "the next connection is not cut");
 }

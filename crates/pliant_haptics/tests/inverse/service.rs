@@ -31,8 +31,13 @@ pub(super) struct Desk {
     /// An answer is being held back.
     pub(super) held: bool,
     pub(super) sent: bool,
+    /// The service does not greet who connects. `waits` says that somebody has.
+    pub(super) unfriendly: bool,
+    pub(super) waits: bool,
     pub(super) quit: bool,
     pub(super) hang_up: bool,
+    /// Number of connections that have ended.
+    pub(super) ended: usize,
     /// The force on the motors: the last one that was sent, and nothing after the end of the
     /// connection.
     pub(super) motor: f64,
@@ -72,7 +77,8 @@ impl Service {
                             let end = socket.get_ref();
                             end.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
                             serve(socket, &shared, inventory, new);
-                            shared.lock().unwrap().motor = 0.0;
+                            let mut desk = shared.lock().unwrap();
+                            (desk.motor, desk.ended) = (0.0, desk.ended + 1);
                         }
                     }
                     Err(_) => std::thread::sleep(Duration::from_millis(2)),
@@ -140,6 +146,12 @@ pub(super) fn state(desk: &Desk, new: bool) -> Value {
 /// Serves one connection: an inventory, then exactly one state per command. A command that differs
 /// from the documentation ends the connection.
 fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool, new: bool) {
+    while shared.lock().is_ok_and(|mut desk| {
+        desk.waits = desk.unfriendly && !desk.quit;
+        desk.waits
+    }) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
     let inventory = state(&shared.lock().unwrap(), inventory).to_string();
     if socket.send(Message::text(inventory)).is_err() {
         return;
