@@ -156,6 +156,34 @@ fn a_device_that_hangs_as_it_is_closed_does_not_hang_who_opens_another() {
 }
 
 #[test]
+fn no_force_is_sent_while_the_call_that_cuts_it_hangs() {
+    let path = fake("dhd", "off_hangs", &["-DWITHOUT_WATCHDOG"]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let mut game = Game::start(ForceDimension::open(dhd(&path)).unwrap());
+    game.pull(&library);
+    call!(library, "fake_off_hangs", fn(c_int), 1);
+    hang_dhd(&library, true);
+    wait_for!(library, "fake_in_off");
+    // The driver answers again, and the call that should cut its force does not.
+    hang_dhd(&library, false);
+    game.until("the driver sends no force", |_| motor(&library) == 0.0);
+    let mut force = 0.0f64;
+    for _ in 0..50 {
+        game.publish();
+        std::thread::sleep(Duration::from_millis(2));
+        force = force.max(motor(&library));
+    }
+    let state = game.publish().state;
+    rise(&library);
+    call!(library, "fake_off_hangs", fn(c_int), 0);
+    println!("Force Dimension, its cut hangs: {state:?}, {force} N meanwhile");
+    assert_eq!((state, force), (LoopState::ForceOff, 0.0));
+    game.pull(&library);
+    assert!(rise(&library) < 0.02, "by the ramp");
+}
+
+#[test]
 fn what_waits_from_a_connection_before_does_nothing_to_the_next() {
     let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
     let (path, library) = hd_at_5_mm("late_callbacks");

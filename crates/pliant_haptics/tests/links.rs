@@ -297,10 +297,13 @@ fn a_cut_that_stops_the_scheduler_stops_it_once_and_it_starts_again() {
 fn a_frame_is_touched_by_one_thread_at_a_time() {
     loom::model(|| {
         let frame = Arc::new((Turn::default(), UnsafeCell::new(1)));
+        let given_up = Arc::new(AtomicBool::new(false));
         frame.0.ask();
-        let theirs = frame.clone();
+        let (theirs, gone) = (frame.clone(), given_up.clone());
         let servo = thread::spawn(move || {
+            let gone = gone.load(Ordering::Acquire);
             if theirs.0.begin() {
+                assert!(!gone, "a frame that was given up runs");
                 // SAFETY: loom tells if another thread touches it.
                 theirs.1.with_mut(|value| unsafe { *value += 1 });
                 theirs.0.end();
@@ -312,7 +315,10 @@ fn a_frame_is_touched_by_one_thread_at_a_time() {
             assert_eq!(frame.1.with(|value| unsafe { *value }), 2);
             // SAFETY: as above. This is the next frame.
             frame.1.with_mut(|value| unsafe { *value = 1 });
+        } else {
+            given_up.store(true, Ordering::Release);
         }
         servo.join().unwrap();
+        assert!(!frame.0.begin(), "a frame runs twice");
     });
 }

@@ -11,7 +11,7 @@
 struct state {
     double position[3], velocity[3], rotation[3][3], wrench[6], sent_at;
     int made, open, enabled, reset, error, major, buttons, gone, robotic, driving, drives, stuck;
-    int watchdog, expert, cause, user_off, hang, hung, slow, opening;
+    int watchdog, expert, cause, user_off, hang, hung, slow, opening, off_hangs, in_off;
     double felt, rise, open_time, start_time;
 };
 static struct state own;
@@ -87,6 +87,7 @@ int dhdGetStatus(int status[16], char id) {
     return r;
 }
 int dhdEnableForce(unsigned char on, char id) {
+    while (!on && s.off_hangs) { s.in_off = 1; usleep(100); }
     int r = result(id);
     if (r < 0) return r;
     if (on && !s.enabled) s.sent_at = now();
@@ -169,6 +170,9 @@ void fake_slow_open(double open, double start) { s.open_time = open; s.start_tim
 int fake_opening(void) { return s.opening; }
 void fake_hang(int on) { s.hang = on; }
 int fake_hung(void) { return s.hung; }
+/* The call that switches the force off hangs. */
+void fake_off_hangs(int on) { s.off_hangs = on; }
+int fake_in_off(void) { return s.in_off; }
 /* The button on the device that switches its force off. */
 void fake_user_off(int off) { s.user_off = off; feel(); }
 /* The force that was sent last. */
