@@ -1,4 +1,4 @@
-//! Tests that what users meet can be looked at in `bevy-inspector-egui`: each component and
+//! Tests that what users meet can be looked at and set in `bevy-inspector-egui`: each component and
 //! resource, with all of its fields, and a body with a hand while it moves.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
@@ -16,6 +16,17 @@ use pliant::{
     net::{HostConfig, NetPlugin},
     prelude::*,
 };
+
+/// What an inspector can only name, and why.
+const OPAQUE: [(&str, &str); 4] = [
+    (
+        "VisualState",
+        "what is shown, not a setting: the two poses between which it goes on are not made by hand",
+    ),
+    ("SurfacePart", "a part of a drawn mesh: Bevy's `Range` has no inspector"),
+    ("BakeNode", "its material and anchors are data of `pliant_bake`, which knows no engine"),
+    ("SavedState", "the state of a solver, as it is saved"),
+];
 
 fn app() -> App {
     let mut app = App::new();
@@ -67,14 +78,19 @@ fn an_inspector_shows_every_field_of_our_components_and_resources() {
         .filter_map(|kind| Some((kind.type_info().type_path(), kind.data::<ReflectDefault>()?.default())))
         .collect();
     assert!(ours.len() > 40, "{} types", ours.len());
-    let mut wrong = Vec::new();
+    let (mut wrong, mut opaque) = (Vec::new(), Vec::new());
     for (path, mut value) in ours {
         let texts = texts(|ui| {
             bevy_inspector::ui_for_value(&mut *value, ui, app.world_mut());
         });
-        wrong.extend(complaints(&texts).into_iter().map(|text| format!("{path}: {text}")));
+        let name = path.rsplit("::").next().unwrap();
+        match OPAQUE.iter().find(|(opaque, _)| *opaque == name) {
+            Some((name, _)) => opaque.extend((!complaints(&texts).is_empty()).then_some(*name)),
+            None => wrong.extend(complaints(&texts).into_iter().map(|text| format!("{path}: {text}"))),
+        }
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
+    assert_eq!(opaque.len(), OPAQUE.len(), "these can be looked at by now: all but {opaque:?}");
 }
 
 #[test]

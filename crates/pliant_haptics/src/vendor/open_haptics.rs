@@ -19,6 +19,8 @@
 mod info;
 mod scheduler;
 mod servo;
+#[cfg(test)]
+mod tests;
 
 use std::ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void};
 use std::mem::ManuallyDrop;
@@ -26,6 +28,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use libloading::Library;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
@@ -186,13 +189,22 @@ impl OpenHaptics {
             if cfg!(windows) { &["hd.dll"][..] } else { &["libHD.so", "libHD.so.3", "libHD.so.3.4"][..] };
         let (library, path) = load(config.library.as_ref(), names)?;
         let api = OpenHapticsApi::from(&library, &path)?;
-        let switch = Arc::new(HdForceSwitch {
-            api,
-            link: Link::new(),
-            posting: AtomicBool::new(false),
-            _library: Arc::new(library),
-        });
-        let mut device = Self {
+        let mut device = Self::closed(api, Arc::new(library), config);
+        device.connect()?;
+        // SAFETY: the library returns a static string.
+        let version = unsafe { text((api.get_string)(VERSION)) };
+        if version.split('.').next().and_then(|n| n.parse::<u32>().ok()).is_some_and(|major| major < 3) {
+            return Err(VendorError::Version { library: path, found: version, needed: "3" });
+        }
+        Ok(device)
+    }
+
+    /// A device that is not open yet.
+    fn closed(api: OpenHapticsApi, library: Arc<Library>, config: OpenHapticsConfig) -> Self {
+        let switch =
+            HdForceSwitch { api, link: Link::new(), posting: AtomicBool::new(false), _library: library };
+        let switch = Arc::new(switch);
+        Self {
             api,
             handle: None,
             info: describe(&config),
@@ -204,14 +216,7 @@ impl OpenHaptics {
             held: None,
             was_held: false,
             dead: false,
-        };
-        device.connect()?;
-        // SAFETY: the library returns a static string.
-        let version = unsafe { text((api.get_string)(VERSION)) };
-        if version.split('.').next().and_then(|n| n.parse::<u32>().ok()).is_some_and(|major| major < 3) {
-            return Err(VendorError::Version { library: path, found: version, needed: "3" });
         }
-        Ok(device)
     }
 
     fn connect(&mut self) -> Result<(), VendorError> {

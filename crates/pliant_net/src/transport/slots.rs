@@ -187,6 +187,13 @@ mod tests {
         assert!(slots.take(&limits, now, here).is_none(), "all are present");
         slots.free(first[1]);
         assert!(slots.take(&limits, now, here).is_some());
+        // Nor does one that is present make room for another of its own address.
+        let mut slots = Slots::default();
+        for _ in 0..3 {
+            let (id, _) = slots.take(&limits, now, here).unwrap();
+            slots.taken.get_mut(&id).unwrap().present = true;
+        }
+        assert!(slots.take(&limits, now, here).is_none(), "all of its address are present");
     }
 
     #[test]

@@ -28,10 +28,11 @@ pub struct PanelPlugin {
 }
 
 /// A section of the panel.
-#[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[reflect(Clone, PartialEq)]
+#[derive(Reflect, Debug, Default, Clone, Copy, PartialEq, Eq, Hash)]
+#[reflect(Default, Clone, PartialEq)]
 pub enum PanelSection {
     /// Pause, single steps, speed and step time.
+    #[default]
     Time,
     /// The bodies and the hands on them.
     Bodies,
