@@ -127,10 +127,11 @@ mod imp {
 
     pub(super) type Stamp = Timespec;
 
-    /// `CLOCK_MONOTONIC` of Linux does not count the time for which the machine is suspended.
-    #[cfg(any(target_os = "linux", target_os = "android"))]
+    /// `CLOCK_MONOTONIC` of Linux does not count the time for which the machine is suspended. Miri
+    /// knows no other.
+    #[cfg(all(any(target_os = "linux", target_os = "android"), not(miri)))]
     const CLOCK: ClockId = ClockId::Boottime;
-    #[cfg(target_os = "freebsd")]
+    #[cfg(any(target_os = "freebsd", miri))]
     const CLOCK: ClockId = ClockId::Monotonic;
 
     /// The seconds for which a test pretends that the machine was suspended, as the clock counts

@@ -23,7 +23,6 @@ mod servo;
 mod tests;
 
 use std::ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void};
-use std::mem::ManuallyDrop;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -171,7 +170,7 @@ pub struct OpenHaptics {
     held: Option<bool>,
     /// Whether the switch has ever been seen closed. What an open one means before is not known.
     was_held: bool,
-    frame: ManuallyDrop<Box<ScheduledFrame>>,
+    frame: Arc<ScheduledFrame>,
     /// Whether the scheduler did not run the last frame. The frame is its own from then on, because
     /// it may run it at any time, and the device gets another one when it is opened again.
     dead: bool,
@@ -209,7 +208,7 @@ impl OpenHaptics {
             handle: None,
             info: describe(&config),
             config,
-            frame: ManuallyDrop::new(ScheduledFrame::new(switch.clone())),
+            frame: ScheduledFrame::new(switch.clone()),
             switch,
             renewal: Renewal::default(),
             late: false,
@@ -271,8 +270,8 @@ impl OpenHaptics {
         }
         self.handle = Some(handle);
         if std::mem::take(&mut self.dead) {
-            // The scheduler may still run the frame before, which is never freed.
-            self.frame = ManuallyDrop::new(ScheduledFrame::new(self.switch.clone()));
+            // The scheduler may still run the frame before.
+            self.frame = ScheduledFrame::new(self.switch.clone());
         }
         (self.renewal, self.late, self.held) = (Renewal::default(), false, None);
         self.switch.link.open(handle);
@@ -304,21 +303,20 @@ impl OpenHaptics {
         if self.dead {
             return Err(Fault::NotRun);
         }
-        let frame = &mut **self.frame;
+        let mut frame = self.frame.data();
         (frame.device, frame.force, frame.leave) = (device, force, leave);
         frame.idle = leave || self.late || self.renewal.has_lapsed();
         (frame.held, frame.was_held) = (self.held, self.was_held);
         (frame.force_on, frame.buttons) = (false, 0);
         (frame.position, frame.velocity, frame.transform) = ([f64::NAN; 3], [0.0; 3], [0.0; 16]);
         frame.error = ErrorInfo::default();
-        frame.turn.ask();
-        let frame = &raw mut *frame;
-        // SAFETY: the call returns after the callback or without it. In the second case the frame
-        // is given up: it is not touched again, and never freed.
-        let ran = unsafe {
-            (self.api.run)(servo, frame.cast(), PRIORITY);
-            (*frame).turn.take()
-        };
+        drop(frame);
+        self.frame.turn.ask();
+        let count = Arc::into_raw(self.frame.clone()).cast_mut();
+        // SAFETY: the callback takes over the count. A scheduler that never runs it leaves the count
+        // behind.
+        unsafe { (self.api.run)(servo, count.cast(), PRIORITY) };
+        let ran = self.frame.turn.take();
         if !ran {
             // The call has returned without having run the callback, and maybe without an error.
             // The motors still have the last force.
@@ -328,7 +326,7 @@ impl OpenHaptics {
             HdStop(self.switch.clone()).cut();
             return Err(Fault::NotRun);
         }
-        let frame = &**self.frame;
+        let frame = self.frame.data();
         self.held = frame.held;
         self.was_held |= frame.held == Some(true);
         self.late = self.renewal.renew();
@@ -421,10 +419,6 @@ impl Drop for OpenHaptics {
     fn drop(&mut self) {
         self.safe_stop();
         self.disconnect();
-        if !self.dead {
-            // SAFETY: the scheduler has run the last frame, and nothing uses the frame after this.
-            unsafe { ManuallyDrop::drop(&mut self.frame) };
-        }
     }
 }
 

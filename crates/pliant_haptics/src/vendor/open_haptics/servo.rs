@@ -2,7 +2,7 @@
 
 use std::ffi::{c_int, c_uchar, c_uint, c_ushort, c_void};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, LazyLock, Mutex, MutexGuard, TryLockError};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::time::{Duration, Instant};
 
 use libloading::Library;
@@ -131,10 +131,17 @@ impl StopHandle for HdStop {
     }
 }
 
-/// Input and output of a callback. The device keeps it at one place in memory, because a scheduler
-/// that is stuck may run the callback late.
+/// A callback of the servo thread. Each has a count of its own of it, because a scheduler that is
+/// stuck may run the callback when the device is gone.
 pub(super) struct ScheduledFrame {
     pub(super) switch: Arc<HdForceSwitch>,
+    /// Whether the servo thread may touch `data`.
+    pub(super) turn: Turn,
+    data: Mutex<FrameData>,
+}
+
+/// Input and output of a callback.
+pub(super) struct FrameData {
     pub(super) device: Handle,
     pub(super) force: [f64; 3],
     /// Whether the force is to be zero, because it comes back or ends.
@@ -145,8 +152,6 @@ pub(super) struct ScheduledFrame {
     pub(super) held: Option<bool>,
     /// Whether an open safety switch means that the force is off.
     pub(super) was_held: bool,
-    /// Whether the servo thread may touch the rest.
-    pub(super) turn: Turn,
     /// Whether the force was sent as it was given.
     pub(super) force_on: bool,
     pub(super) position: [f64; 3],
@@ -158,23 +163,27 @@ pub(super) struct ScheduledFrame {
 }
 
 impl ScheduledFrame {
-    pub(super) fn new(switch: Arc<HdForceSwitch>) -> Box<Self> {
-        Box::new(Self {
-            switch,
+    pub(super) fn new(switch: Arc<HdForceSwitch>) -> Arc<Self> {
+        let data = FrameData {
             device: INVALID,
             force: [0.0; 3],
             idle: true,
             leave: false,
             held: None,
             was_held: false,
-            turn: Turn::default(),
             force_on: false,
-            position: [0.0; 3],
+            position: [f64::NAN; 3],
             velocity: [0.0; 3],
             transform: [0.0; 16],
             buttons: 0,
             error: ErrorInfo::default(),
-        })
+        };
+        Arc::new(Self { switch, turn: Turn::default(), data: Mutex::new(data) })
+    }
+
+    /// The data, for whoever's turn it is, so that nobody waits for it.
+    pub(super) fn data(&self) -> MutexGuard<'_, FrameData> {
+        self.data.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -182,17 +191,17 @@ impl ScheduledFrame {
 /// was given up does nothing.
 ///
 /// # Safety
-/// `data` is a `ScheduledFrame` that is never freed before it has run or without its turn.
+/// `data` is one count of an `Arc<ScheduledFrame>`, which this function takes over.
 pub(super) unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
-    let data = data.cast::<ScheduledFrame>();
-    // SAFETY: the frame is there, and the turn is made for two threads.
-    let turn = unsafe { &(*data).turn };
-    if !turn.begin() {
+    // SAFETY: the caller passes the count over.
+    let scheduled = unsafe { Arc::from_raw(data.cast_const().cast::<ScheduledFrame>()) };
+    if !scheduled.turn.begin() {
         return CALLBACK_DONE;
     }
-    // SAFETY: it is this thread's turn, until it ends.
-    let frame = unsafe { &mut *data };
-    let api = frame.switch.api;
+    let mut data = scheduled.data();
+    let frame = &mut *data;
+    let switch = &scheduled.switch;
+    let api = switch.api;
     // SAFETY: the calls and the lengths of their arrays are those of the header, and the calls lie
     // between begin and end, as the header requires. The frame makes its device the current one.
     unsafe {
@@ -205,7 +214,7 @@ pub(super) unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
         let taken = held == Some(true) && frame.held == Some(false);
         let released = held == Some(false) && frame.was_held;
         frame.held = held;
-        let seen = frame.switch.link.seen();
+        let seen = switch.link.seen();
         let enabled = (api.is_enabled)(FORCE_OUTPUT) != 0;
         frame.force_on = !(frame.idle || seen.cut || !enabled || taken || released);
         let force = if frame.force_on { frame.force } else { [0.0; 3] };
@@ -222,9 +231,10 @@ pub(super) unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
         } else if (seen.cut || !enabled) && frame.error.code == 0 {
             // The supervisor or the library has switched the force off. It comes back at zero.
             (api.enable)(FORCE_OUTPUT);
-            frame.switch.link.answer(seen);
+            switch.link.answer(seen);
         }
     }
-    frame.turn.end();
+    drop(data);
+    scheduled.turn.end();
     CALLBACK_DONE
 }
