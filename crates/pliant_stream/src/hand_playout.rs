@@ -63,6 +63,11 @@ impl HandPlayout {
         }
     }
 
+    /// Number of targets that wait to be played.
+    pub fn waiting(&self) -> usize {
+        self.queue.len()
+    }
+
     /// Takes a received target. `input` numbers all targets of the guest, which moves `hands` hands
     /// at a time. Missing targets between two received ones are interpolated linearly.
     pub fn take(&mut self, input: u32, hands: usize, target: Vector3<f64>) {

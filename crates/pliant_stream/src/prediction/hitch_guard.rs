@@ -5,9 +5,9 @@
 //! within a tick, and the copy answers with a force that the body never gives, because the host
 //! plays the same targets smoothly. The host's own reactions, which arrive with every tick, are the
 //! measure: after a hitch, no hand is displayed more than a fifth beyond the largest of the last
-//! second, until the host has the hand where this guest sent it. The same holds for a second after
-//! another's hand has come or gone, after a jump of the hand itself, and after an event that has
-//! changed what the copy predicts by more than a twentieth of that measure.
+//! second of this guest's time, until the host has the hand where this guest sent it. The same
+//! holds for a second after another's hand has come or gone, after a jump of the hand itself, and
+//! after an event that has changed what the copy predicts by more than a twentieth of that measure.
 //! Where no frame comes at all, the reaction fades.
 
 use std::collections::VecDeque;
@@ -20,7 +20,7 @@ use crate::state::Tick;
 /// A pause in the calls, or in the frames, that counts as a hitch: at least this long, and at least
 /// four ticks.
 const HITCH: Duration = Duration::from_millis(100);
-/// How long the bound applies after a hitch.
+/// How long the bound applies after a hitch, and how long a reaction counts that the host has made.
 const AFTER: Duration = Duration::from_secs(1);
 /// How long it applies at least after the host has found the hand again.
 const PROLONGED: Duration = Duration::from_millis(250);
@@ -34,17 +34,30 @@ const FADE: f64 = 0.1;
 /// Time in which the whole reaction returns, s.
 const RETURN: f64 = 0.25;
 
+/// The largest reaction of a guest's hands at a tick.
+#[derive(Debug, Clone, Copy)]
+struct Given {
+    tick: Tick,
+    /// When its frame has come on this guest's clock, or would have if it had not waited.
+    at: Duration,
+    /// N.
+    reaction: f64,
+}
+
 /// Bounds the reactions of a guest's own hands on one body.
 #[derive(Debug)]
 pub(crate) struct HitchGuard {
-    /// The largest reaction that the host has sent for each tick of the last second, N.
-    given: VecDeque<(Tick, f64)>,
+    /// What the host has sent for each tick of the last second of the body.
+    given: VecDeque<Given>,
+    /// Time that a frame is on its way.
+    way: Duration,
     called: Option<Duration>,
     bounded_until: Duration,
     /// Share of the reaction that is displayed, 0 to 1.
     share: f64,
     hitch: Duration,
-    /// Ticks in a second.
+    /// Length of a tick, and ticks in a second.
+    h: Duration,
     second: u64,
 }
 
@@ -53,24 +66,50 @@ impl HitchGuard {
     pub(crate) fn new(h: f64) -> Self {
         Self {
             given: VecDeque::new(),
+            way: Duration::ZERO,
             called: None,
             bounded_until: Duration::ZERO,
             share: 1.0,
             hitch: HITCH.max(Duration::from_secs_f64(4.0 * h)),
+            h: Duration::from_secs_f64(h),
             second: (1.0 / h) as u64,
         }
     }
 
     /// Keeps the largest reaction (N) of the guest's hands at a tick whose frame has arrived.
-    pub(crate) fn give(&mut self, tick: Tick, reaction: f64) {
-        while self.given.front().is_some_and(|(first, _)| first + self.second < tick) {
+    pub(crate) fn give(&mut self, now: Duration, tick: Tick, reaction: f64) {
+        let kept = |first: &Given| first.tick < tick && tick <= first.tick + self.second;
+        while self.given.front().is_some_and(|first| !kept(first)) {
             self.given.pop_front();
         }
-        self.given.push_back((tick, reaction));
+        // Of frames that have waited on their way and come at once, the older ones are older.
+        for before in self.given.iter_mut().rev() {
+            let since = self.h * tick.saturating_sub(before.tick) as u32;
+            if before.at + since <= now {
+                break;
+            }
+            before.at = now.saturating_sub(since);
+        }
+        // Who stood still does not know when a frame came, and takes it for one of a host that ran.
+        let waited = self.called.is_some_and(|called| now.saturating_sub(called) > self.hitch);
+        let expected =
+            self.given.back().filter(|_| waited).map(|last| last.at + self.h * (tick - last.tick) as u32);
+        self.given.push_back(Given { tick, at: expected.map_or(now, |at| at.min(now)), reaction });
     }
 
-    /// Notes the time of a call, and for how long no frame has come. A body that rests has none.
-    pub(crate) fn pass(&mut self, now: Duration, quiet: Duration) {
+    /// The newest tick that was given.
+    pub(crate) fn newest(&self) -> Option<Tick> {
+        self.given.back().map(|given| given.tick)
+    }
+
+    /// Notes the time of a call, whether the body rests, so that no frames come and it gives what
+    /// it gave last, and how long a frame is on its way.
+    pub(crate) fn pass(&mut self, now: Duration, resting: bool, way: Duration) {
+        self.way = way;
+        if let (true, Some(last)) = (resting, self.given.back_mut()) {
+            last.at = now;
+        }
+        let quiet = self.given.back().map_or(Duration::ZERO, |last| now.saturating_sub(last.at));
         let passed = self.called.map_or(Duration::ZERO, |called| now.saturating_sub(called));
         self.called = Some(now);
         if passed > self.hitch || quiet > self.hitch {
@@ -96,7 +135,7 @@ impl HitchGuard {
     /// Bounds for a second, because another's hand has come or gone: the copy learns of it late. A
     /// hand that has only just taken hold has no measure, and is not bounded.
     pub(crate) fn disturb(&mut self, now: Duration) {
-        let held = self.given.iter().filter(|(_, given)| *given > 0.0).count() as u64;
+        let held = self.given.iter().filter(|given| given.reaction > 0.0).count() as u64;
         if held > self.second / 2 {
             self.bounded_until = self.bounded_until.max(now + AFTER);
         }
@@ -117,9 +156,12 @@ impl HitchGuard {
         }
     }
 
-    /// The largest reaction that the host has sent in the last second, N.
+    /// The largest reaction that the host has made within the last second, N, of those that have
+    /// arrived.
     fn most(&self) -> f64 {
-        self.given.iter().map(|(_, given)| *given).fold(0.0, f64::max)
+        let since = (self.called.unwrap_or_default() + self.way).saturating_sub(AFTER);
+        let given = self.given.iter().filter(|given| given.at >= since);
+        given.map(|given| given.reaction).fold(0.0, f64::max)
     }
 
     /// Returns the reaction that is displayed to a hand, N.
@@ -139,39 +181,71 @@ mod tests {
 
     const MS: Duration = Duration::from_millis(1);
 
+    fn pass(guard: &mut HitchGuard, now: Duration, quiet: Duration) {
+        if let (true, Some(last)) = (quiet.is_zero(), guard.given.back_mut()) {
+            last.at = now;
+        }
+        guard.pass(now, false, Duration::ZERO);
+    }
+
     #[test]
     fn a_reaction_is_bounded_for_a_second_after_a_hitch_and_free_before_and_after() {
         let mut guard = HitchGuard::new(0.025);
         for tick in 1..=80 {
-            guard.give(tick, 0.1 * tick as f64);
-            guard.pass(tick as u32 * 25 * MS, Duration::ZERO);
+            guard.give(tick as u32 * 25 * MS, tick, 0.1 * tick as f64);
+            pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
         }
         assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "no hitch");
-        guard.pass(2300 * MS, Duration::ZERO);
+        pass(&mut guard, 2300 * MS, Duration::ZERO);
         let bounded = Vector3::from(guard.bound([0.0, 30.0, 0.0])).norm();
         assert!((bounded - 9.6).abs() < 1e-9, "{bounded}");
         assert_eq!(guard.bound([0.0, 3.0, 0.0]), [0.0, 3.0, 0.0]);
-        (0..=50).for_each(|k| guard.pass((2300 + 20 * k) * MS, Duration::ZERO));
+        (0..=50).for_each(|k| pass(&mut guard, (2300 + 20 * k) * MS, Duration::ZERO));
         assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "a second later");
         // Only what was given in the last second counts.
-        let given: Vec<Tick> = guard.given.iter().map(|g| g.0).collect();
+        let given: Vec<Tick> = guard.given.iter().map(|g| g.tick).collect();
         assert!(given[0] == 40 && given.len() == 41, "{given:?}");
+    }
+
+    #[test]
+    fn a_reaction_counts_for_a_second_of_the_guest_s_time() {
+        let mut guard = HitchGuard::new(0.025);
+        let most = |guard: &HitchGuard| guard.bound([99.0, 0.0, 0.0])[0] / BEYOND;
+        for tick in 1..=40 {
+            guard.give(tick as u32 * 25 * MS, tick, if tick < 30 { 3.0 } else { 1.0 });
+            guard.pass(tick as u32 * 25 * MS, false, Duration::ZERO);
+        }
+        // The host stands still for 0.7 s and goes on where it was.
+        pass(&mut guard, 1700 * MS, Duration::ZERO);
+        guard.give(1725 * MS, 41, 1.0);
+        assert!((most(&guard) - 3.0).abs() < 1e-9, "{}", most(&guard));
+        pass(&mut guard, 1750 * MS, Duration::ZERO);
+        assert!((most(&guard) - 1.0).abs() < 1e-9, "{}", most(&guard));
+        // Frames that have waited come at once, and are as old as if they had not.
+        for tick in 42..=90 {
+            guard.give(2950 * MS, tick, if tick < 50 { 2.0 } else { 1.0 });
+        }
+        pass(&mut guard, 2950 * MS, Duration::ZERO);
+        assert!((most(&guard) - 1.0).abs() < 1e-9, "{}", most(&guard));
+        // A body that rests sends nothing, and gives what it gave last.
+        guard.pass(9000 * MS, true, Duration::ZERO);
+        assert!((most(&guard) - 1.0).abs() < 1e-9, "{}", most(&guard));
     }
 
     #[test]
     fn a_hand_that_comes_or_goes_bounds_the_others_that_have_held_for_a_while() {
         let mut guard = HitchGuard::new(0.025);
-        guard.pass(Duration::ZERO, Duration::ZERO);
-        guard.give(1, 1.0);
+        pass(&mut guard, Duration::ZERO, Duration::ZERO);
+        guard.give(Duration::ZERO, 1, 1.0);
         guard.disturb(Duration::ZERO);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "it has only just taken hold");
         for tick in 2..=60 {
-            guard.give(tick, 1.0);
-            guard.pass(tick as u32 * 25 * MS, Duration::ZERO);
+            guard.give(tick as u32 * 25 * MS, tick, 1.0);
+            pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
         }
         guard.disturb(1500 * MS);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
-        (60..=101).for_each(|k| guard.pass(k * 25 * MS, Duration::ZERO));
+        (60..=101).for_each(|k| pass(&mut guard, k * 25 * MS, Duration::ZERO));
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");
     }
 
@@ -179,26 +253,27 @@ mod tests {
     fn a_prediction_that_news_change_is_bounded_for_a_second() {
         let mut guard = HitchGuard::new(0.025);
         for tick in 1..=60 {
-            guard.give(tick, 1.0);
-            guard.pass(tick as u32 * 25 * MS, Duration::ZERO);
+            guard.give(tick as u32 * 25 * MS, tick, 1.0);
+            pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
             guard.surprise(tick as u32 * 25 * MS, 0.049);
         }
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "no surprise");
         guard.surprise(1500 * MS, 0.051);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
-        (60..=101).for_each(|k| guard.pass(k * 25 * MS, Duration::ZERO));
+        (60..=101).for_each(|k| pass(&mut guard, k * 25 * MS, Duration::ZERO));
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");
     }
 
     #[test]
     fn the_bound_lasts_until_the_host_has_found_the_hand() {
         let mut guard = HitchGuard::new(0.025);
-        guard.give(1, 1.0);
-        guard.pass(Duration::ZERO, Duration::ZERO);
+        guard.give(Duration::ZERO, 1, 1.0);
+        pass(&mut guard, Duration::ZERO, Duration::ZERO);
         guard.prolong(Duration::ZERO);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "without a hitch, nothing is prolonged");
         for k in 5..=165 {
-            guard.pass(25 * k * MS, Duration::ZERO);
+            guard.give(25 * k * MS, k.into(), 1.0);
+            pass(&mut guard, 25 * k * MS, Duration::ZERO);
             guard.prolong(25 * k * MS);
             assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2, "{k}");
         }
@@ -207,18 +282,18 @@ mod tests {
     #[test]
     fn a_reaction_that_is_not_known_fades_and_returns_slowly() {
         let mut guard = HitchGuard::new(0.025);
-        guard.give(1, 10.0);
+        guard.give(Duration::ZERO, 1, 10.0);
         let bounded = |guard: &HitchGuard| guard.bound([10.0, 0.0, 0.0])[0];
         let mut last = 10.0;
         for k in 0..=70 {
-            guard.pass(10 * k * MS, 10 * k * MS);
+            pass(&mut guard, 10 * k * MS, 10 * k * MS);
             let now = bounded(&guard);
             assert!(now <= last && (k > 10 || now == 10.0), "{now} after {k}0 ms");
             last = now;
         }
         assert!(last < 0.1, "{last} after 0.7 s");
         for k in 71..=100 {
-            guard.pass(10 * k * MS, Duration::ZERO);
+            pass(&mut guard, 10 * k * MS, Duration::ZERO);
             let now = bounded(&guard);
             assert!(now - last <= 0.4 + 1e-9, "from {last} to {now} in 10 ms");
             last = now;

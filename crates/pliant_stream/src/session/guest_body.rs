@@ -369,14 +369,30 @@ impl StreamedBody {
         }
     }
 
+    /// Tells the guard of hitches what the host has sent of the guest's own hands. What is shown
+    /// may still contain the error of a prediction.
+    fn measure(&mut self, user: UserId) {
+        let Some(history) = self.receiver.as_ref().map(Receiver::history) else { return };
+        let highest = history.highest();
+        let newest = self.hitches.newest().filter(|newest| *newest <= highest);
+        let from = newest.map_or(highest, |newest| newest + 1).max(highest.saturating_sub(HISTORY as u64));
+        for tick in from..=highest {
+            let Some(data) = history.known(tick) else { continue };
+            let own = data.grabs.iter().filter(|g| g.state.key.user == user);
+            let reactions = own.map(|g| Vector3::from(g.state.reaction).norm());
+            self.hitches.give(self.received_at, tick, reactions.fold(0.0, f64::max));
+        }
+    }
+
     /// Steps to all ticks that are due by now. Returns the number of ticks.
     pub(crate) fn advance(&mut self, now: Duration, user: UserId, round_trip: Duration) -> u64 {
         let guesses = self.guesses();
         if self.receiver.is_none() {
             return 0;
         }
+        self.measure(user);
+        self.hitches.pass(now, self.resting, round_trip / 2);
         let quiet = if self.resting { Duration::ZERO } else { now.saturating_sub(self.received_at) };
-        self.hitches.pass(now, quiet);
         let quiet = quiet > self.config.stall_after;
         let behind = |receiver: &Receiver| receiver.tick() + CATCH_UP < receiver.history().highest();
         if quiet || self.receiver.as_ref().is_some_and(behind) {
@@ -415,10 +431,6 @@ impl StreamedBody {
             }
             let Some(receiver) = &self.receiver else { break };
             if let Some(data) = receiver.history().known(receiver.tick()) {
-                // What is shown may still contain the error of a prediction. This was sent.
-                let own = data.grabs.iter().filter(|g| g.state.key.user == user);
-                let reactions = own.map(|g| Vector3::from(g.state.reaction).norm());
-                self.hitches.give(receiver.tick(), reactions.fold(0.0, f64::max));
                 let others = data.grabs.iter().map(|g| g.state.key).filter(|key| key.user != user);
                 let hands = others.fold(0_u64, |sum, key| {
                     // A digest, since no list is kept: the numbers of a hand, spread and added.

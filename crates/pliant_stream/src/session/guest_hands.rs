@@ -16,8 +16,8 @@ use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets, che
 const TARGET_EVERY: Duration = Duration::from_millis(250);
 /// A hand jumps when its way over its last targets is farther than this share of the body's size,
 /// and farther than its longest ways before these by this factor. The host eases such a jump, as a
-/// [`HandPlayout`](crate::HandPlayout) does.
-const JUMP: [f64; 2] = [0.05, 1.5];
+/// [`HandPlayout`](crate::HandPlayout) does whose hand moves by twenty sizes a second at most.
+const JUMP: [f64; 2] = [0.0075, 1.5];
 /// Number of targets over which a hand may jump. A device that has been away does not always come
 /// back with one.
 const JUMP_TARGETS: usize = 3;
@@ -48,20 +48,24 @@ impl LocalGrab {
         (!self.targets.is_empty()).then_some(due)
     }
 
-    /// Takes the next target. Returns the longest way over the last targets that is farther than
-    /// the hand has moved of late, m, or zero.
-    fn jumped(&mut self, target: Vector3<f64>) -> f64 {
+    /// Takes the next target. Returns whether the hand has jumped over its last targets, farther
+    /// than `least` m. A jump says nothing of how a hand moves, so its usual way grows slowly.
+    fn jumped(&mut self, target: Vector3<f64>, least: f64) -> bool {
         let last = std::mem::replace(&mut self.last, target);
         if self.before.len() >= JUMP_TARGETS {
             self.before.pop_front();
         }
         self.before.push_back((last, self.usual));
-        self.usual = (target - last).norm().max(FORGETTING * self.usual);
-        let ways = self.before.iter().rev().zip(1..).map(|(&(from, usual), count)| {
-            let way = (target - from).norm();
-            if way > JUMP[1] * f64::from(count) * usual { way } else { 0.0 }
+        let fastest = least.max(JUMP[1] * self.usual);
+        self.usual = (target - last).norm().min(fastest).max(FORGETTING * self.usual);
+        let mut ways = self.before.iter().rev().zip(1..);
+        let jumped = ways.any(|(&(from, usual), count)| {
+            (target - from).norm() > least.max(JUMP[1] * f64::from(count) * usual)
         });
-        ways.fold(0.0, f64::max)
+        if jumped {
+            self.before.clear();
+        }
+        jumped
     }
 }
 
@@ -132,11 +136,9 @@ impl GuestSession {
         own.targets.push_back(TargetEntry { grab, input: self.input, target });
         own.fresh = true;
         let target = Vector3::from(target);
-        let far = own.jumped(target);
         let Some(body) = self.bodies.get_mut(&own.body) else { return Ok(()) };
-        if body.model().is_some_and(|model| far > JUMP[0] * model.size()) {
+        if own.jumped(target, body.model().map_or(f64::INFINITY, |model| JUMP[0] * model.size())) {
             body.hitches.jump();
-            own.before.clear();
         }
         if let Some(predicted) = body.predicted.as_mut() {
             predicted.set(grab, target.into());
