@@ -205,18 +205,11 @@ pub(crate) enum MaybeRelaxation {
 }
 
 #[reflect_remote(Relaxation)]
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
 #[reflect(Debug, Default, Clone, PartialEq)]
 pub(crate) struct ReflectedRelaxation {
     ratio: f64,
     time: f64,
-}
-
-/// What an inspector begins with where a body is to relax: nothing relaxes yet.
-impl Default for ReflectedRelaxation {
-    fn default() -> Self {
-        Self(Relaxation { ratio: 0.0, time: 1.0 })
-    }
 }
 
 /// Selects what moves a body. Default: [`Local`](Self::Local).

@@ -30,6 +30,13 @@ pub struct Relaxation {
     pub time: f64,
 }
 
+/// A material that relaxes by nothing (ratio 0), within a second.
+impl Default for Relaxation {
+    fn default() -> Self {
+        Self { ratio: 0.0, time: 1.0 }
+    }
+}
+
 impl Relaxation {
     /// Checks both values.
     ///
