@@ -156,10 +156,10 @@ impl HitchGuard {
         }
     }
 
-    /// The largest reaction that the host has made within the last second, N, of those that have
-    /// arrived.
+    /// The largest reaction that the host has made within the last second but a tick, N, of those
+    /// that have arrived.
     fn most(&self) -> f64 {
-        let since = (self.called.unwrap_or_default() + self.way).saturating_sub(AFTER);
+        let since = (self.called.unwrap_or_default() + self.way + self.h).saturating_sub(AFTER);
         let given = self.given.iter().filter(|given| given.at >= since);
         given.map(|given| given.reaction).fold(0.0, f64::max)
     }
