@@ -79,10 +79,10 @@ fn messages_wait_for_the_next_frame_after_enough_work_and_hands_move_on() {
     for peer in [first, second] {
         inbox.open(peer, left(peer));
         inbox.pop().unwrap();
-        for _ in 0..2 {
-            inbox.push_message(peer, bytes(0), 64 << 20).unwrap();
-            inbox.push_datagram(peer, Instant::now(), bytes(1), 64);
-        }
+    }
+    for peer in [first, second, first, second] {
+        inbox.push_message(peer, bytes(0), 64 << 20).unwrap();
+        inbox.push_datagram(peer, Instant::now(), bytes(1), 64);
     }
     // What is read in each frame, and what each message of it costs.
     for (messages, datagrams, work) in [(1, 4, WORK_IN_A_FRAME), (1, 0, 1 << 40), (2, 0, WORK_IN_A_FRAME / 2)]
