@@ -154,8 +154,7 @@ pub fn device(bytes: &[u8]) {
 
 /// Bodies of saved games. One that was taken must go on, with finite numbers, and be saved again.
 pub fn saved(bytes: &[u8]) {
-    let Ok(saved) = postcard::from_bytes::<SavedBody>(bytes) else { return };
-    let Ok((mut body, _)) = Body::restore(loose(), BodyConfig::default(), &saved, None) else { return };
+    let Some(mut body) = restored(bytes) else { return };
     body.set_obstacles(ground()).expect("sound");
     for _ in 0..4 {
         if body.step().is_err() {
@@ -169,15 +168,27 @@ pub fn saved(bytes: &[u8]) {
     body.save(|_| true);
 }
 
-/// A body that lies on the ground and is held, after some steps.
-pub fn saved_body() -> SavedBody {
+/// The body of a saved game, if it is sound.
+pub fn restored(bytes: &[u8]) -> Option<Body> {
+    let saved = postcard::from_bytes::<SavedBody>(bytes).ok()?;
+    Body::restore(loose(), BodyConfig::default(), &saved, None).ok().map(|(body, _)| body)
+}
+
+/// A body that lies on the ground, after some steps, held at so many vertices by hands that move.
+pub fn saved_body(hands: u32, hold: GrabConfig, steps: u32) -> SavedBody {
     let (settings, _) = falls();
     let config = BodyConfig { settings, ..BodyConfig::default() };
     let mut body = Body::new(loose(), config).expect("sound");
     body.set_obstacles(ground()).expect("sound");
-    let patch = pliant_modal::Patch::around(body.model().surface(), 3, 0.1).expect("sound");
-    body.grab(&patch, GrabConfig::default()).expect("room");
-    for _ in 0..30 {
+    let patch = |vertex| pliant_modal::Patch::around(body.model().surface(), vertex, 0.1).expect("sound");
+    let patches: Vec<_> = (0..hands).map(|hand| patch(3 - hand)).collect();
+    let grabs: Vec<_> = patches.iter().map(|patch| body.grab(patch, hold).expect("room")).collect();
+    for step in 0..steps {
+        for grab in &grabs {
+            let mut target = body.target(*grab).expect("held");
+            target[1] += 0.01 * f64::from(step % 7);
+            body.set_target(*grab, target).expect("held");
+        }
         body.step().expect("sound");
     }
     body.save(|_| true)
