@@ -260,6 +260,9 @@ fn whole_body_grabs_of_many_guests_at_once_come_a_few_in_a_frame() {
     let model = bar_of(CELLS);
     let transport = HostOptions { limits: limits(), ..HostOptions::default() };
     let (mut host, invite, _) = host_of(HostConfig { transport, ..HostConfig::default() }, model.clone());
+    // Who sees the body tells that the host shares it.
+    let mut watcher = guest(&invite, JoinConfig { models: vec![model.clone()], ..JoinConfig::default() });
+    run_until(&mut [&mut host, &mut watcher], "the body is shared", |apps| body_of(apps[1]));
     let guests: Vec<Endpoint> = (0..7)
         .map(|_| {
             let limits = Limits { message: Limits::guest().message, ..limits() };
@@ -282,7 +285,7 @@ fn whole_body_grabs_of_many_guests_at_once_come_a_few_in_a_frame() {
                 }
             }
         }
-        apps[0].world().resource::<NetHost>().session().users().count() == guests.len()
+        apps[0].world().resource::<NetHost>().session().users().count() == 1 + guests.len()
     });
     for guest in &guests {
         for grab in 0..2 {
