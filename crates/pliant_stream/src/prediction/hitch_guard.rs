@@ -76,8 +76,9 @@ impl HitchGuard {
         }
     }
 
-    /// Keeps the largest reaction (N) of the guest's hands at a tick whose frame has arrived.
-    pub(crate) fn give(&mut self, now: Duration, tick: Tick, reaction: f64) {
+    /// Keeps the largest reaction (N) of the guest's hands at a tick whose frame has arrived, or
+    /// that a later frame `repeats`.
+    pub(crate) fn give(&mut self, now: Duration, tick: Tick, reaction: f64, repeats: bool) {
         let kept = |first: &Given| first.tick < tick && tick <= first.tick + self.second;
         while self.given.front().is_some_and(|first| !kept(first)) {
             self.given.pop_front();
@@ -90,8 +91,9 @@ impl HitchGuard {
             }
             before.at = now.saturating_sub(since);
         }
-        // Who stood still does not know when a frame came, and takes it for one of a host that ran.
-        let waited = self.called.is_some_and(|called| now.saturating_sub(called) > self.hitch);
+        // Who stood still does not know when a frame came, nor when the host made what is repeated. It
+        // counts as made by a host that ran.
+        let waited = repeats || self.called.is_some_and(|called| now.saturating_sub(called) > self.hitch);
         let expected =
             self.given.back().filter(|_| waited).map(|last| last.at + self.h * (tick - last.tick) as u32);
         self.given.push_back(Given { tick, at: expected.map_or(now, |at| at.min(now)), reaction });
@@ -192,7 +194,7 @@ mod tests {
     fn a_reaction_is_bounded_for_a_second_after_a_hitch_and_free_before_and_after() {
         let mut guard = HitchGuard::new(0.025);
         for tick in 1..=80 {
-            guard.give(tick as u32 * 25 * MS, tick, 0.1 * tick as f64);
+            guard.give(tick as u32 * 25 * MS, tick, 0.1 * tick as f64, false);
             pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
         }
         assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "no hitch");
@@ -212,18 +214,23 @@ mod tests {
         let mut guard = HitchGuard::new(0.025);
         let most = |guard: &HitchGuard| guard.bound([99.0, 0.0, 0.0])[0] / BEYOND;
         for tick in 1..=40 {
-            guard.give(tick as u32 * 25 * MS, tick, if tick < 30 { 3.0 } else { 1.0 });
+            guard.give(tick as u32 * 25 * MS, tick, if tick < 30 { 3.0 } else { 1.0 }, false);
             guard.pass(tick as u32 * 25 * MS, false, Duration::ZERO);
         }
         // The host stands still for 0.7 s and goes on where it was.
         pass(&mut guard, 1700 * MS, Duration::ZERO);
-        guard.give(1725 * MS, 41, 1.0);
+        guard.give(1725 * MS, 41, 1.0, false);
         assert!((most(&guard) - 3.0).abs() < 1e-9, "{}", most(&guard));
         pass(&mut guard, 1750 * MS, Duration::ZERO);
         assert!((most(&guard) - 1.0).abs() < 1e-9, "{}", most(&guard));
+        // What a frame repeats may be from before the host stood still again.
+        guard.give(2600 * MS, 42, 3.0, true);
+        guard.give(2600 * MS, 43, 1.0, false);
+        pass(&mut guard, 2850 * MS, Duration::ZERO);
+        assert!((most(&guard) - 1.0).abs() < 1e-9, "{}", most(&guard));
         // Frames that have waited come at once, and are as old as if they had not.
-        for tick in 42..=90 {
-            guard.give(2950 * MS, tick, if tick < 50 { 2.0 } else { 1.0 });
+        for tick in 44..=90 {
+            guard.give(2950 * MS, tick, if tick < 50 { 2.0 } else { 1.0 }, false);
         }
         pass(&mut guard, 2950 * MS, Duration::ZERO);
         assert!((most(&guard) - 1.0).abs() < 1e-9, "{}", most(&guard));
@@ -236,11 +243,11 @@ mod tests {
     fn a_hand_that_comes_or_goes_bounds_the_others_that_have_held_for_a_while() {
         let mut guard = HitchGuard::new(0.025);
         pass(&mut guard, Duration::ZERO, Duration::ZERO);
-        guard.give(Duration::ZERO, 1, 1.0);
+        guard.give(Duration::ZERO, 1, 1.0, false);
         guard.disturb(Duration::ZERO);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "it has only just taken hold");
         for tick in 2..=60 {
-            guard.give(tick as u32 * 25 * MS, tick, 1.0);
+            guard.give(tick as u32 * 25 * MS, tick, 1.0, false);
             pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
         }
         guard.disturb(1500 * MS);
@@ -253,7 +260,7 @@ mod tests {
     fn a_prediction_that_news_change_is_bounded_for_a_second() {
         let mut guard = HitchGuard::new(0.025);
         for tick in 1..=60 {
-            guard.give(tick as u32 * 25 * MS, tick, 1.0);
+            guard.give(tick as u32 * 25 * MS, tick, 1.0, false);
             pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
             guard.surprise(tick as u32 * 25 * MS, 0.049);
         }
@@ -267,12 +274,12 @@ mod tests {
     #[test]
     fn the_bound_lasts_until_the_host_has_found_the_hand() {
         let mut guard = HitchGuard::new(0.025);
-        guard.give(Duration::ZERO, 1, 1.0);
+        guard.give(Duration::ZERO, 1, 1.0, false);
         pass(&mut guard, Duration::ZERO, Duration::ZERO);
         guard.prolong(Duration::ZERO);
         assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "without a hitch, nothing is prolonged");
         for k in 5..=165 {
-            guard.give(25 * k * MS, k.into(), 1.0);
+            guard.give(25 * k * MS, k.into(), 1.0, false);
             pass(&mut guard, 25 * k * MS, Duration::ZERO);
             guard.prolong(25 * k * MS);
             assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2, "{k}");
@@ -282,7 +289,7 @@ mod tests {
     #[test]
     fn a_reaction_that_is_not_known_fades_and_returns_slowly() {
         let mut guard = HitchGuard::new(0.025);
-        guard.give(Duration::ZERO, 1, 10.0);
+        guard.give(Duration::ZERO, 1, 10.0, false);
         let bounded = |guard: &HitchGuard| guard.bound([10.0, 0.0, 0.0])[0];
         let mut last = 10.0;
         for k in 0..=70 {

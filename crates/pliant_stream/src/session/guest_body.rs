@@ -380,7 +380,8 @@ impl StreamedBody {
             let Some(data) = history.known(tick) else { continue };
             let own = data.grabs.iter().filter(|g| g.state.key.user == user);
             let reactions = own.map(|g| Vector3::from(g.state.reaction).norm());
-            self.hitches.give(self.received_at, tick, reactions.fold(0.0, f64::max));
+            let repeats = tick < highest;
+            self.hitches.give(self.received_at, tick, reactions.fold(0.0, f64::max), repeats);
         }
     }
 
