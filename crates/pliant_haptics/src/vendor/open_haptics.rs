@@ -313,8 +313,8 @@ impl OpenHaptics {
         drop(frame);
         self.frame.turn.ask();
         let count = Arc::into_raw(self.frame.clone()).cast_mut();
-        // SAFETY: the callback takes over the count. A scheduler that never runs it leaves the count
-        // behind.
+        // SAFETY: the callback takes over the count. A scheduler that never runs it leaves the
+        // count behind.
         unsafe { (self.api.run)(servo, count.cast(), PRIORITY) };
         let ran = self.frame.turn.take();
         if !ran {

@@ -96,8 +96,8 @@ pub fn hang_dhd(library: &Library, on: bool) {
     }
 }
 
-/// Sets what the fake's servo does: 0 is alive, 1 dead, 2 stuck, 3 stuck in the caller's call only, 4
-/// stuck in every call that schedules something.
+/// Sets what the fake's servo does: 0 is alive, 1 dead, 2 stuck, 3 stuck in the caller's call only,
+/// 4 stuck in every call that schedules something.
 pub fn servo(library: &Library, mode: c_int) {
     call!(library, "fake_servo", fn(c_int), mode);
     if mode >= 2 {

@@ -312,8 +312,8 @@ impl HostWatch {
         let [r, g, b, a] = view.color.to_f32_array().map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8);
         let place = |at: &Placement| (at.position, at.orientation);
         body.moves |= !free && place(&body.entry.placement) != place(&seen.placement);
-        // Once an anchored body is moved, its frames have its pose, too: a catalog is no way to send
-        // a movement.
+        // Once an anchored body is moved, its frames have its pose, too: a catalog is no way to
+        // send a movement.
         let placement = Placement { scale: seen.placement.scale, ..body.entry.placement };
         let placement = if placement.is_valid() { placement } else { body.entry.placement };
         let (entry, color) = (&mut body.entry, [r, g, b, a]);

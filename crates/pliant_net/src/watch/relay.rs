@@ -115,8 +115,8 @@ impl RelayOptions {
     }
 }
 
-/// A relay's address as logs and watchers may have it: what follows the question mark is secret, and
-/// so are a user and a password.
+/// A relay's address as logs and watchers may have it: what follows the question mark is secret,
+/// and so are a user and a password.
 pub(super) fn without_token(relay: &str) -> String {
     let shown = relay.split(['?', '#']).next().unwrap_or_default();
     let Some((scheme, rest)) = shown.split_once("://") else { return shown.to_owned() };
