@@ -91,8 +91,8 @@ impl HitchGuard {
             }
             before.at = now.saturating_sub(since);
         }
-        // Who stood still does not know when a frame came, nor when the host made what is repeated.
-        // It counts as made by a host that ran.
+        // Who stood still does not know when a frame came, nor anybody when the host made what is
+        // repeated. Both count as made by a host that ran.
         let waited = repeats || self.called.is_some_and(|called| now.saturating_sub(called) > self.hitch);
         let expected =
             self.given.back().filter(|_| waited).map(|last| last.at + self.h * (tick - last.tick) as u32);
