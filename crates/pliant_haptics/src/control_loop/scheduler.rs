@@ -248,6 +248,7 @@ mod tests {
         assert!((long.dt - 0.102).abs() < 1e-12 && long.now == long.dt);
         assert_eq!(scheduler.wait().dt, 0.002);
     }
+
     /// A hand that is held away from the center, and that a suspended machine finds further away.
     #[cfg(any(target_os = "linux", target_os = "android"))]
     struct Held(std::sync::Arc<std::sync::Mutex<f64>>);

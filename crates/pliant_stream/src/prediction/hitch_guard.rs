@@ -79,8 +79,11 @@ impl HitchGuard {
     /// Keeps the largest reaction (N) of the guest's hands at a tick whose frame has arrived, or
     /// that a later frame `repeats`.
     pub(crate) fn give(&mut self, now: Duration, tick: Tick, reaction: f64, repeats: bool) {
-        let kept = |first: &Given| first.tick < tick && tick <= first.tick + self.second;
-        while self.given.front().is_some_and(|first| !kept(first)) {
+        // A host that began anew goes on at an earlier tick, and what was given later is another's.
+        while self.given.back().is_some_and(|last| last.tick >= tick) {
+            self.given.pop_back();
+        }
+        while self.given.front().is_some_and(|first| tick - first.tick > self.second) {
             self.given.pop_front();
         }
         // Of frames that have waited on their way and come at once, the older ones are older.
@@ -262,6 +265,18 @@ mod tests {
         guard.give(1800 * MS, 42, 1.0, false);
         guard.pass(2050 * MS, false, Duration::ZERO);
         assert_eq!(guard.most(), 1.0);
+    }
+
+    #[test]
+    fn ticks_may_go_back_and_leap_as_far_as_a_host_says() {
+        let mut guard = HitchGuard::new(0.025);
+        // A host that began anew goes on below, and a hostile one at the end of all numbers.
+        for tick in [100, 120, 140, 130, 110, 110, Tick::MAX - 1, Tick::MAX, 1, 2] {
+            guard.give(Duration::from_secs(1), tick, 1.0, true);
+            assert_eq!(guard.newest(), Some(tick));
+        }
+        pass(&mut guard, Duration::from_secs(1), Duration::ZERO);
+        assert_eq!(guard.given.len(), 2, "{:?}", guard.given);
     }
 
     #[test]

@@ -375,7 +375,9 @@ impl StreamedBody {
         let Some(history) = self.receiver.as_ref().map(Receiver::history) else { return };
         let highest = history.highest();
         let newest = self.hitches.newest().filter(|newest| *newest <= highest);
-        let from = newest.map_or(highest, |newest| newest + 1).max(highest.saturating_sub(HISTORY as u64));
+        let from = newest
+            .map_or(highest, |newest| newest.saturating_add(1))
+            .max(highest.saturating_sub(HISTORY as u64));
         for tick in from..=highest {
             let Some(data) = history.known(tick) else { continue };
             let own = data.grabs.iter().filter(|g| g.state.key.user == user);
