@@ -432,6 +432,12 @@ fn worst(play: Play, who: Who, seeds: u64, lasts: Duration) -> Outcome {
         [|o: &Outcome| o.looks, |o: &Outcome| o.lost].map(|of| all.iter().map(of).sum::<usize>());
     let share = lost as f64 / looks.max(1) as f64;
     assert!(share <= MAX_LOST, "{play:?}, {who:?}: {share:.3} of the ticks are near a guessed one");
+    // Of each session, where one hand moves all the time and one process stalls. Where both do, few
+    // looks of a session are calm.
+    let shares = all.iter().map(|o| o.lost as f64 / o.looks.max(1) as f64);
+    let worst = shares.fold(0.0, f64::max);
+    let few = !play.stays() || matches!(who, Who::Both);
+    assert!(worst <= MAX_LOST || few, "{play:?}, {who:?}: {worst:.3} of a session's ticks");
     println!(
         "{play:?}, {who:?}: {seeds} sessions of {lasts:?}: largest reaction shown over largest true one of the \
          last second {:.3} after a hitch and {:.3} otherwise (true {truth:.2} N), shape within 1 % after \
