@@ -19,6 +19,9 @@ use crate::wire::{Clock, ReceiverReport};
 use round_trip::RoundTrip;
 use tally::{DatagramArrival, Tally, loss_of};
 
+/// Pause between two updates beyond which what comes next may have waited here.
+const STOOD_STILL: Duration = Duration::from_millis(45);
+
 /// State of a connection: sequence numbers, loss, round trip, time of the last reception, and
 /// counts.
 #[derive(Debug)]
@@ -27,6 +30,7 @@ pub(crate) struct Link {
     /// Largest size of a datagram, bytes.
     pub(crate) max_datagram: usize,
     received_at: Duration,
+    updated_at: Duration,
     sequence: u16,
     received: Tally,
     round_trip: RoundTrip,
@@ -41,6 +45,7 @@ impl Link {
             peer,
             max_datagram,
             received_at: now,
+            updated_at: now,
             sequence: 0,
             received: Tally::default(),
             round_trip: RoundTrip::default(),
@@ -52,6 +57,18 @@ impl Link {
     /// Restarts the idle timeout, because the other side sent something or is given more time.
     pub(crate) fn received_at(&mut self, now: Duration) {
         self.received_at = now;
+    }
+
+    /// Notes the time of an update, before which everything that had come was processed.
+    pub(crate) fn updated(&mut self, now: Duration) {
+        self.updated_at = now;
+    }
+
+    /// Time that a datagram which is processed `now` has waited here at most, because this process
+    /// stood still; zero where it did not.
+    pub(crate) fn waited(&self, now: Duration) -> Duration {
+        let waited = now.saturating_sub(self.updated_at);
+        if waited > STOOD_STILL { waited } else { Duration::ZERO }
     }
 
     /// Returns whether nothing was received for longer than `patience`.
@@ -117,8 +134,12 @@ impl Link {
         Clock { report: self.received.report(), round_trip, ..Clock::default() }
     }
 
-    /// Adds a round trip that this side or the other side measured.
-    pub(crate) fn sample_round_trip(&mut self, sample: Duration) {
+    /// Adds a round trip that this side or the other side measured. The datagrams have `waited` for
+    /// some part of it at most, because a process stood still. Such a sample is taken for as long as
+    /// the path is known to be, where that is possible.
+    pub(crate) fn sample_round_trip(&mut self, sample: Duration, waited: Duration) {
+        let known = self.round_trip().filter(|_| !waited.is_zero());
+        let sample = known.map_or(sample, |known| known.clamp(sample.saturating_sub(waited), sample));
         self.round_trip.sample(sample);
         self.last_round_trips = [self.last_round_trips[1], sample];
     }

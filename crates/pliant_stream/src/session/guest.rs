@@ -240,8 +240,13 @@ impl GuestSession {
             }
             Datagram::Pong(clock) => {
                 self.link.take_report(clock.report);
-                if let Some(rtt) = self.clock.sample(clock.t1, clock.t2, clock.t3, micros(now)) {
-                    self.link.sample_round_trip(rtt);
+                // The host's clock is compared when the host processed the request, since nobody
+                // knows when a request that waited there has come.
+                if let Some(waited) = clock.t3.checked_sub(clock.t2)
+                    && let Some(rtt) = self.clock.sample(clock.t1, clock.t3, clock.t3, micros(now))
+                {
+                    let waited = Duration::from_micros(waited).saturating_add(self.link.waited(now));
+                    self.link.sample_round_trip(rtt, waited);
                 }
             }
             _ => self.link.reject(),
@@ -370,6 +375,7 @@ impl GuestSession {
     /// Call this once a frame and at [`GuestSession::next_wakeup`]. Returns the number of ticks of
     /// all bodies together.
     pub fn update(&mut self, now: Duration) -> u64 {
+        self.link.updated(now);
         let Some(user) = self.user() else {
             let waits = self.standing == GuestStanding::Greeted;
             if waits && self.link.is_silent(now, self.config.idle_timeout) {

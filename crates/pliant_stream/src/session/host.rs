@@ -318,6 +318,7 @@ impl HostSession {
             let (bytes, round_trip) = (p.link.stats.bytes_out, p.link.least_round_trip());
             p.regulator.judge(now, bytes, round_trip, self.config.guest_rate);
             p.link.stats.level = p.regulator.level();
+            p.link.updated(now);
         }
         self.send_models(now);
     }

@@ -119,9 +119,10 @@ impl GuestPeer {
         true
     }
 
-    /// Answers a clock request that arrived at `now`, and is answered at `now`.
+    /// Answers a clock request that is processed, and answered, at `now`.
     pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, out: &mut VecDeque<Output>) {
-        let clock = Clock { t1, t2: micros(now), t3: micros(now), round_trip: 0, ..self.link.clock() };
+        let t2 = micros(now.saturating_sub(self.link.waited(now)));
+        let clock = Clock { t1, t2, t3: micros(now), round_trip: 0, ..self.link.clock() };
         self.link.send_datagram(|sequence| Datagram::Pong(clock).encode(sequence), out);
     }
 

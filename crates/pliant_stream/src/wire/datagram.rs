@@ -64,13 +64,14 @@ pub struct ReceiverReport {
     pub highest: u32,
 }
 
-/// Clock exchange with four timestamps (NTP): `t1` guest sends, `t2` host receives, `t3` host
-/// sends, `t4` guest receives.
+/// Clock exchange with four timestamps, as of NTP: `t1` guest sends, `t2` host receives at the
+/// earliest, `t3` host processes and sends, `t4` guest receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Clock {
     /// Guest's clock when the guest sends, us.
     pub t1: u64,
-    /// Host's clock when the host receives, us.
+    /// Host's clock when the host received at the earliest, us. It is `t3` unless the host stood
+    /// still.
     pub t2: u64,
     /// Host's clock when the host sends, us.
     pub t3: u64,

@@ -75,7 +75,8 @@ impl HostSession {
                 p.link.take_report(clock.report);
                 // Zero means that the guest has not measured a round trip yet.
                 if clock.round_trip > 0 {
-                    p.link.sample_round_trip(Duration::from_micros(u64::from(clock.round_trip)));
+                    let sample = Duration::from_micros(u64::from(clock.round_trip));
+                    p.link.sample_round_trip(sample, Duration::ZERO);
                 }
                 p.send_pong(now, clock.t1, &mut self.out);
             }
