@@ -8,7 +8,7 @@
 //! second of this guest's time, until the host has the hand where this guest sent it. The same
 //! holds for a second after another's hand has come or gone, after a jump of the hand itself, and
 //! after an event that has changed what the copy predicts by more than a twentieth of that measure.
-//! Where no frame comes at all, the reaction fades.
+//! It also holds where frames are due and none comes, and if it lasts, the reaction fades.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -20,6 +20,15 @@ use crate::state::Tick;
 /// A pause in the calls, or in the frames, that counts as a hitch: at least this long, and at least
 /// four ticks.
 const HITCH: Duration = Duration::from_millis(100);
+/// A shorter pause in the calls, after which a hand may have jumped: at least this long, and at
+/// least so many times the usual one of late.
+const PAUSE: Duration = Duration::from_millis(45);
+const PAUSES: f64 = 2.0;
+/// Factor by which a usual pause grows at most, and is forgotten, from one call to the next.
+const GROWING: f64 = 1.5;
+const FORGETTING: f64 = 0.98;
+/// Ticks without a frame from which on the bound applies until one comes.
+const WAITS: f64 = 2.5;
 /// How long the bound applies after a hitch, and how long a reaction counts that the host has made.
 const AFTER: Duration = Duration::from_secs(1);
 /// How long it applies at least after the host has found the hand again.
@@ -52,7 +61,11 @@ pub(crate) struct HitchGuard {
     /// Time that a frame is on its way.
     way: Duration,
     called: Option<Duration>,
+    /// The usual time between two calls of late.
+    usual: Duration,
     bounded_until: Duration,
+    /// Whether frames are due and none comes.
+    waits: bool,
     /// Share of the reaction that is displayed, 0 to 1.
     share: f64,
     hitch: Duration,
@@ -68,7 +81,9 @@ impl HitchGuard {
             given: VecDeque::new(),
             way: Duration::ZERO,
             called: None,
+            usual: Duration::ZERO,
             bounded_until: Duration::ZERO,
+            waits: false,
             share: 1.0,
             hitch: HITCH.max(Duration::from_secs_f64(4.0 * h)),
             h: Duration::from_secs_f64(h),
@@ -117,9 +132,14 @@ impl HitchGuard {
         let quiet = self.given.back().map_or(Duration::ZERO, |last| now.saturating_sub(last.at));
         let passed = self.called.map_or(Duration::ZERO, |called| now.saturating_sub(called));
         self.called = Some(now);
-        if passed > self.hitch || quiet > self.hitch {
+        self.waits = quiet > self.h.mul_f64(WAITS) && self.knows();
+        let paused = passed > PAUSE.max(self.usual.mul_f64(PAUSES)) && self.most() > 0.0;
+        if paused || passed > self.hitch || quiet > self.hitch {
             self.bounded_until = now + AFTER;
         }
+        // An app with long frames does not stand still.
+        let longest = PAUSE.max(self.usual.mul_f64(GROWING));
+        self.usual = passed.min(longest).max(self.usual.mul_f64(FORGETTING));
         if quiet > self.hitch {
             let unknown = passed.min(quiet - self.hitch).as_secs_f64();
             self.share *= (-unknown / FADE).exp();
@@ -140,10 +160,15 @@ impl HitchGuard {
     /// Bounds for a second, because another's hand has come or gone: the copy learns of it late. A
     /// hand that has only just taken hold has no measure, and is not bounded.
     pub(crate) fn disturb(&mut self, now: Duration) {
-        let held = self.given.iter().filter(|given| given.reaction > 0.0).count() as u64;
-        if held > self.second / 2 {
+        if self.knows() {
             self.bounded_until = self.bounded_until.max(now + AFTER);
         }
+    }
+
+    /// Returns whether the host has told of the hands for half a second of the last one.
+    fn knows(&self) -> bool {
+        let held = self.given.iter().filter(|given| given.reaction > 0.0).count() as u64;
+        held > self.second / 2
     }
 
     /// Bounds for a second, as [`HitchGuard::disturb`] does, because the hand itself has jumped:
@@ -173,7 +198,7 @@ impl HitchGuard {
     pub(crate) fn bound(&self, reaction: [f64; 3]) -> [f64; 3] {
         let reaction = Vector3::from(reaction) * self.share;
         let bounded = self.called.is_some_and(|now| now < self.bounded_until);
-        if !bounded {
+        if !bounded && !self.waits {
             return reaction.into();
         }
         reaction.cap_magnitude(BEYOND * self.most()).into()
@@ -240,6 +265,51 @@ mod tests {
         // A body that rests sends nothing, and gives what it gave last.
         guard.pass(9000 * MS, true, Duration::ZERO);
         assert_eq!(guard.most(), 1.0);
+    }
+
+    #[test]
+    fn a_short_pause_of_an_app_bounds_and_long_frames_do_not() {
+        let run = |guard: &mut HitchGuard, from: u32, to: u32, frame: u32| {
+            for ms in (from..=to).step_by(frame as usize) {
+                guard.give(ms * MS, u64::from(ms / 25), 1.0, false);
+                guard.pass(ms * MS, false, Duration::ZERO);
+            }
+        };
+        let shown = |guard: &HitchGuard| guard.bound([9.0, 0.0, 0.0])[0];
+        let mut guard = HitchGuard::new(0.025);
+        run(&mut guard, 0, 1500, 25);
+        assert_eq!(shown(&guard), 9.0);
+        guard.give(1555 * MS, 62, 1.0, false);
+        guard.pass(1555 * MS, false, Duration::ZERO);
+        assert_eq!(shown(&guard), 1.2, "55 ms where 25 ms are usual");
+        run(&mut guard, 1575, 2600, 25);
+        assert_eq!(shown(&guard), 9.0);
+        // Twenty frames a second.
+        run(&mut guard, 2650, 6000, 50);
+        assert_eq!(shown(&guard), 9.0);
+        run(&mut guard, 6050, 9000, 50);
+        assert_eq!(shown(&guard), 9.0);
+        guard.give(9095 * MS, 363, 1.0, false);
+        guard.pass(9095 * MS, false, Duration::ZERO);
+        assert_eq!(shown(&guard), 9.0, "95 ms where 50 ms are usual");
+    }
+
+    #[test]
+    fn where_frames_are_due_the_bound_applies_until_one_comes() {
+        let mut guard = ran();
+        let shown = |guard: &HitchGuard| guard.bound([9.0, 0.0, 0.0])[0];
+        [1020, 1040, 1060].into_iter().for_each(|ms| guard.pass(ms * MS, false, Duration::ZERO));
+        assert_eq!(shown(&guard), 9.0, "two may be lost");
+        guard.pass(1065 * MS, false, Duration::ZERO);
+        assert!((shown(&guard) - 3.6).abs() < 1e-9, "{}", shown(&guard));
+        guard.give(1075 * MS, 43, 1.0, false);
+        guard.pass(1075 * MS, false, Duration::ZERO);
+        assert_eq!(shown(&guard), 9.0);
+        // A hand that has only just taken hold has no measure.
+        let mut guard = HitchGuard::new(0.025);
+        guard.give(Duration::ZERO, 1, 1.0, false);
+        (0..=4).for_each(|k| guard.pass(20 * k * MS, false, Duration::ZERO));
+        assert_eq!(shown(&guard), 9.0);
     }
 
     #[test]
