@@ -205,6 +205,26 @@ fn a_peer_that_stalls_for_two_seconds_catches_up_within_one() {
 }
 
 #[test]
+fn two_of_four_peers_that_stall_together_catch_up_within_a_second() {
+    let mut mesh = Mesh::new(4, &LinkConfig { delay: 30 * MS, ..LinkConfig::default() }, 3);
+    (0..4).for_each(|k| mesh.start(k, LateInputRepair::Rollback, true));
+    mesh.run(4 * S);
+    let stalled = [1, 2].map(|k| mesh.peers[k].take());
+    mesh.run(6 * S);
+    for (k, peer) in [1, 2].into_iter().zip(stalled) {
+        mesh.peers[k] = peer;
+    }
+    mesh.run(7 * S);
+    let ticks: Vec<u64> = mesh.peers.iter().flatten().map(PeerSession::tick).collect();
+    assert!(ticks.iter().max().unwrap() - ticks.iter().min().unwrap() <= 8, "{ticks:?}");
+    mesh.run(9 * S);
+    for other in 1..4 {
+        let off = mesh.agree(0, other);
+        assert!(off < 1e-6, "{other}: {off}");
+    }
+}
+
+#[test]
 fn a_peer_that_dies_lets_go() {
     let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper3), 9);
     for k in 0..3 {

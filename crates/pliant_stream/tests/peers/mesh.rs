@@ -86,13 +86,13 @@ impl Mesh {
 
     pub fn hand(k: usize, now: Duration) -> [f64; 3] {
         let t = now.as_secs_f64() + k as f64;
-        let x = [1.0, 0.5, 0.75][k];
-        let size = [0.1, 0.04, 0.06][k];
+        let x = [1.0, 0.5, 0.75, 0.25][k];
+        let size = [0.1, 0.04, 0.06, 0.02][k];
         [x, 0.08 + size * (1.1 * t).sin(), 0.08 + size * (0.7 * t).cos()]
     }
 
-    /// Vertices at x = 1, 1/2, 3/4 on the edge y = z = 0.08.
-    pub(super) const VERTEX: [u32; 3] = [66, 34, 50];
+    /// Vertices at x = 1, 1/2, 3/4, 1/4 on the edge y = z = 0.08.
+    pub(super) const VERTEX: [u32; 4] = [66, 34, 50, 18];
 
     pub fn run(&mut self, until: Duration) {
         while self.now < until {
