@@ -4,20 +4,24 @@ use super::PeerSession;
 
 /// Largest share by which a peer's step is stretched or shortened to match the other peers' ticks.
 const SLEW: f64 = 0.01;
-/// Number of ticks behind all others from which on a peer catches up by steps of its own.
+/// Number of ticks behind half of the others from which on a peer catches up by steps of its own.
 pub(super) const BEHIND: u64 = 8;
 
 impl PeerSession {
-    /// By how many ticks every other peer is at least ahead of this one, and by how many behind,
-    /// judged by the newest tick received from each.
+    /// By how many ticks half of the other peers are at least ahead of this one, and half of them
+    /// behind, judged by the newest tick received from each. Some may have stalled together.
     pub(super) fn lead(&self) -> (u64, u64) {
         let others = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
-        let both = others.map(|o| (o.newest.saturating_sub(self.tick), self.tick.saturating_sub(o.newest)));
-        both.reduce(|a, b| (a.0.min(b.0), a.1.min(b.1))).unwrap_or_default()
+        let mut newest: Vec<u64> = others.map(|o| o.newest).collect();
+        newest.sort_unstable();
+        let half = newest.len().saturating_sub(1) / 2;
+        let of = |at: Option<usize>| at.and_then(|at| newest.get(at)).copied().unwrap_or(self.tick);
+        let (high, low) = (of((newest.len() - half).checked_sub(1)), of(Some(half)));
+        (high.saturating_sub(self.tick), self.tick.saturating_sub(low))
     }
 
-    /// Steps up to `most` of the ticks that this peer has missed, if every other one is well ahead.
-    /// Then it was a stall. Returns the number of ticks.
+    /// Steps up to `most` of the ticks that this peer has missed, if half of the others are well
+    /// ahead. Then it was a stall. Returns the number of ticks.
     pub(super) fn catch_up(&mut self, most: u64) -> u64 {
         let (ahead, _) = self.lead();
         self.catches_up = ahead > if self.catches_up { 0 } else { BEHIND };
