@@ -69,7 +69,7 @@ pub struct PeerSession {
     tick: Tick,
     started: bool,
     next_step: Option<Duration>,
-    /// This peer was behind half of the others and steps until it is not.
+    /// This peer was behind most others and steps until it is not.
     catches_up: bool,
     /// Ticks that a stall has cost, or a jump of the own clock. The others may hurry this peer by
     /// no more than these.

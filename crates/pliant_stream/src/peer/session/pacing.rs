@@ -1,27 +1,32 @@
 //! Pacing: how fast this peer steps, to stay with the others.
 
+use std::time::Duration;
+
 use super::PeerSession;
 
 /// Largest share by which a peer's step is stretched or shortened to match the other peers' ticks.
 const SLEW: f64 = 0.01;
-/// Number of ticks behind half of the others from which on a peer catches up by steps of its own.
+/// Number of ticks behind most others from which on a peer catches up by steps of its own.
 pub(super) const BEHIND: u64 = 8;
+/// Time for which the tick of a peer counts that is not heard of.
+const HEARD: Duration = Duration::from_millis(250);
 
 impl PeerSession {
-    /// By how many ticks half of the other peers are at least ahead of this one, and half of them
-    /// behind, judged by the newest tick received from each. Some may have stalled together.
+    /// By how many ticks most other peers are at least ahead of this one, and by how many behind,
+    /// judged by the newest tick received from each of late. Some may have stalled together.
     pub(super) fn lead(&self) -> (u64, u64) {
-        let others = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
-        let mut newest: Vec<u64> = others.map(|o| o.newest).collect();
+        let known = self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
+        let heard = known.filter(|o| !o.link.is_silent(self.updated, HEARD));
+        let mut newest: Vec<u64> = heard.map(|o| o.newest).collect();
         newest.sort_unstable();
-        let half = newest.len().saturating_sub(1) / 2;
-        let of = |at: Option<usize>| at.and_then(|at| newest.get(at)).copied().unwrap_or(self.tick);
-        let (high, low) = (of((newest.len() - half).checked_sub(1)), of(Some(half)));
+        let half = newest.len() / 2;
+        let of = |at: usize| newest.get(at).copied().unwrap_or(self.tick);
+        let (high, low) = (of(newest.len().saturating_sub(1 + half)), of(half));
         (high.saturating_sub(self.tick), self.tick.saturating_sub(low))
     }
 
-    /// Steps up to `most` of the ticks that this peer has missed, if half of the others are well
-    /// ahead. Then it was a stall. Returns the number of ticks.
+    /// Steps up to `most` of the ticks that this peer has missed, if most others are well ahead.
+    /// Then it was a stall. Returns the number of ticks.
     pub(super) fn catch_up(&mut self, most: u64) -> u64 {
         let (ahead, _) = self.lead();
         self.catches_up = ahead > if self.catches_up { 0 } else { BEHIND };
