@@ -6,7 +6,7 @@ mod support;
 use std::time::Duration;
 
 use pliant_lab::pair::PathConfig;
-use pliant_stream::emulator::LinkConfig;
+use pliant_stream::emulator::{LinkConfig, Loss};
 use pliant_stream::{
     DisconnectReason, GuestEvent, GuestSessionConfig, HostSessionConfig, PeerId, RecoveryConfig,
 };
@@ -111,6 +111,29 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     pair.host.set_max_datagram(PeerId(3), 100);
     pair.run_until(7 * S, &mut scene);
     assert!(scene.saw(2, |e| matches!(e, GuestEvent::Closed { reason: DisconnectReason::SmallDatagrams })));
+}
+
+#[test]
+fn a_path_whose_round_trip_scatters_is_not_taken_for_one_with_a_queue() {
+    let model = bar(120, 0.05);
+    for (seed, jitter) in [(1, 15), (2, 30), (3, 30), (4, 50), (5, 50)] {
+        let loss = Loss::gilbert(0.09, 4.0, 25 * MS);
+        let link = LinkConfig { delay: 40 * MS, jitter: jitter * MS, loss, ..Default::default() };
+        let (mut pair, mut scene) = start(&model);
+        scene.hand = circling();
+        let path = PathConfig::symmetric(link);
+        pair.join_with(GuestSessionConfig::default(), path, seed, cached(&model)).unwrap();
+        let (mut level, mut cut) = (0, 0);
+        for second in 1..=60 {
+            pair.run_until(second * S, &mut scene);
+            let now = pair.host.stats(PeerId(1)).unwrap().level;
+            (level, cut) = (level.max(now), cut + u32::from(now > 0));
+        }
+        let counts = pair.guests[0].session.body(BODY).unwrap().counts();
+        let guessed = counts.guessed as f64 / counts.stepped as f64;
+        println!("{jitter} ms: level {level}, for {cut} of 60 s, {:.1} % guessed", 100.0 * guessed);
+        assert!(level <= 1 && cut <= 6, "{jitter} ms: level {level}, for {cut} s");
+    }
 }
 
 #[test]

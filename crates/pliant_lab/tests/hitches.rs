@@ -386,7 +386,9 @@ fn session(play: Play, model: &Arc<ModalModel>, who: Who, seed: u64, lasts: Dura
         }
         let given = &world.given[guest];
         outcome.truth = given.iter().map(|g| g.force).fold(outcome.truth, f64::max);
-        for shown in &seen.shown {
+        let played = given.last().map_or(0, |given| given.input);
+        // What the host has not played when the session ends is compared with nothing.
+        for shown in seen.shown.iter().filter(|shown| shown.input <= played) {
             let from = given.partition_point(|g| g.at + S < shown.at);
             let to = given.partition_point(|g| g.at <= shown.at || g.input < shown.input) + 1 + FADED;
             let to = to.min(given.len());

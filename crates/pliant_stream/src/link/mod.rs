@@ -19,6 +19,8 @@ use crate::wire::{Clock, ReceiverReport};
 use round_trip::RoundTrip;
 use tally::{DatagramArrival, Tally, loss_of};
 
+/// Number of round trips by which a queue is judged.
+pub(crate) const JUDGED: usize = 3;
 /// Pause between two updates beyond which what comes next may have waited here.
 const STOOD_STILL: Duration = Duration::from_millis(45);
 
@@ -34,7 +36,8 @@ pub(crate) struct Link {
     sequence: u16,
     received: Tally,
     round_trip: RoundTrip,
-    last_round_trips: [Duration; 2],
+    /// Unsmoothed, the newest last.
+    last_round_trips: [Duration; JUDGED],
     /// Counts, and values that only one role measures. [`Link::stats`] adds the other values.
     pub(crate) stats: LinkStats,
 }
@@ -49,7 +52,7 @@ impl Link {
             sequence: 0,
             received: Tally::default(),
             round_trip: RoundTrip::default(),
-            last_round_trips: [Duration::ZERO; 2],
+            last_round_trips: [Duration::ZERO; JUDGED],
             stats: LinkStats::default(),
         }
     }
@@ -130,7 +133,7 @@ impl Link {
 
     /// Returns a clock exchange with the report and the last round trip, without timestamps.
     pub(crate) fn clock(&self) -> Clock {
-        let round_trip = u32::try_from(micros(self.last_round_trips[1])).unwrap_or(u32::MAX);
+        let round_trip = u32::try_from(micros(self.last_round_trips[JUDGED - 1])).unwrap_or(u32::MAX);
         Clock { report: self.received.report(), round_trip, ..Clock::default() }
     }
 
@@ -141,7 +144,8 @@ impl Link {
         let known = self.round_trip().filter(|_| !waited.is_zero());
         let sample = known.map_or(sample, |known| known.clamp(sample.saturating_sub(waited), sample));
         self.round_trip.sample(sample);
-        self.last_round_trips = [self.last_round_trips[1], sample];
+        self.last_round_trips.rotate_left(1);
+        self.last_round_trips[JUDGED - 1] = sample;
     }
 
     /// The smoothed round trip; `None` before the first measurement.
@@ -149,9 +153,9 @@ impl Link {
         self.round_trip.known().map(|[smooth, _]| smooth)
     }
 
-    /// The smaller of the last two unsmoothed round trips; zero before there are two.
-    pub(crate) fn least_round_trip(&self) -> Duration {
-        self.last_round_trips[0].min(self.last_round_trips[1])
+    /// The last three unsmoothed round trips, zero before there are three.
+    pub(crate) fn last_round_trips(&self) -> [Duration; JUDGED] {
+        self.last_round_trips
     }
 
     /// Returns all metrics of the connection.

@@ -8,7 +8,9 @@
 //! second of this guest's time, until the host has the hand where this guest sent it. The same
 //! holds for a second after another's hand has come or gone, after a jump of the hand itself, and
 //! after an event that has changed what the copy predicts by more than a twentieth of that measure.
-//! It also holds where frames are due and none comes, and if it lasts, the reaction fades.
+//! It also holds where frames are due and none comes, and if it lasts, the reaction fades. A hand of
+//! which the host has not told yet may have taken hold of a body that swings, at another moment
+//! than here: it is displayed no more than a fifth beyond the largest reaction of all times.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -58,6 +60,8 @@ struct Given {
 pub(crate) struct HitchGuard {
     /// What the host has sent for each tick of the last second of the body.
     given: VecDeque<Given>,
+    /// The largest reaction that the host has ever sent, N.
+    largest: f64,
     /// Time that a frame is on its way.
     way: Duration,
     called: Option<Duration>,
@@ -79,6 +83,7 @@ impl HitchGuard {
     pub(crate) fn new(h: f64) -> Self {
         Self {
             given: VecDeque::new(),
+            largest: 0.0,
             way: Duration::ZERO,
             called: None,
             usual: Duration::ZERO,
@@ -94,6 +99,7 @@ impl HitchGuard {
     /// Keeps the largest reaction (N) of the guest's hands at a tick whose frame has arrived, or
     /// that a later frame `repeats`.
     pub(crate) fn give(&mut self, now: Duration, tick: Tick, reaction: f64, repeats: bool) {
+        self.largest = self.largest.max(reaction);
         // A host that began anew goes on at an earlier tick, and what was given later is another's.
         while self.given.back().is_some_and(|last| last.tick >= tick) {
             self.given.pop_back();
@@ -194,9 +200,13 @@ impl HitchGuard {
         given.map(|given| given.reaction).fold(0.0, f64::max)
     }
 
-    /// Returns the reaction that is displayed to a hand, N.
-    pub(crate) fn bound(&self, reaction: [f64; 3]) -> [f64; 3] {
-        let reaction = Vector3::from(reaction) * self.share;
+    /// Returns the reaction that is displayed to a hand, N. `known` says whether the host has told
+    /// of the hand.
+    pub(crate) fn bound(&self, reaction: [f64; 3], known: bool) -> [f64; 3] {
+        let mut reaction = Vector3::from(reaction) * self.share;
+        if !known && self.largest > 0.0 {
+            reaction = reaction.cap_magnitude(BEYOND * self.largest);
+        }
         let bounded = self.called.is_some_and(|now| now < self.bounded_until);
         if !bounded && !self.waits {
             return reaction.into();
@@ -225,13 +235,13 @@ mod tests {
             guard.give(tick as u32 * 25 * MS, tick, 0.1 * tick as f64, false);
             pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
         }
-        assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "no hitch");
+        assert_eq!(guard.bound([0.0, 30.0, 0.0], true), [0.0, 30.0, 0.0], "no hitch");
         pass(&mut guard, 2300 * MS, Duration::ZERO);
-        let bounded = Vector3::from(guard.bound([0.0, 30.0, 0.0])).norm();
+        let bounded = Vector3::from(guard.bound([0.0, 30.0, 0.0], true)).norm();
         assert!((bounded - 9.6).abs() < 1e-9, "{bounded}");
-        assert_eq!(guard.bound([0.0, 3.0, 0.0]), [0.0, 3.0, 0.0]);
+        assert_eq!(guard.bound([0.0, 3.0, 0.0], true), [0.0, 3.0, 0.0]);
         (0..=50).for_each(|k| pass(&mut guard, (2300 + 20 * k) * MS, Duration::ZERO));
-        assert_eq!(guard.bound([0.0, 30.0, 0.0]), [0.0, 30.0, 0.0], "a second later");
+        assert_eq!(guard.bound([0.0, 30.0, 0.0], true), [0.0, 30.0, 0.0], "a second later");
         // Only what was given in the last second counts.
         let given: Vec<Tick> = guard.given.iter().map(|g| g.tick).collect();
         assert!(given[0] == 40 && given.len() == 41, "{given:?}");
@@ -275,7 +285,7 @@ mod tests {
                 guard.pass(ms * MS, false, Duration::ZERO);
             }
         };
-        let shown = |guard: &HitchGuard| guard.bound([9.0, 0.0, 0.0])[0];
+        let shown = |guard: &HitchGuard| guard.bound([9.0, 0.0, 0.0], true)[0];
         let mut guard = HitchGuard::new(0.025);
         run(&mut guard, 0, 1500, 25);
         assert_eq!(shown(&guard), 9.0);
@@ -297,7 +307,7 @@ mod tests {
     #[test]
     fn where_frames_are_due_the_bound_applies_until_one_comes() {
         let mut guard = ran();
-        let shown = |guard: &HitchGuard| guard.bound([9.0, 0.0, 0.0])[0];
+        let shown = |guard: &HitchGuard| guard.bound([9.0, 0.0, 0.0], true)[0];
         [1020, 1040, 1060].into_iter().for_each(|ms| guard.pass(ms * MS, false, Duration::ZERO));
         assert_eq!(shown(&guard), 9.0, "two may be lost");
         guard.pass(1065 * MS, false, Duration::ZERO);
@@ -310,6 +320,20 @@ mod tests {
         guard.give(Duration::ZERO, 1, 1.0, false);
         (0..=4).for_each(|k| guard.pass(20 * k * MS, false, Duration::ZERO));
         assert_eq!(shown(&guard), 9.0);
+    }
+
+    #[test]
+    fn a_hand_that_the_host_has_not_told_of_is_bounded_by_all_before() {
+        let mut guard = HitchGuard::new(0.025);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], false)[0], 9.0, "the first hand has no measure");
+        guard.give(25 * MS, 1, 3.0, false);
+        for tick in 2..=100 {
+            guard.give(tick as u32 * 25 * MS, tick, 0.0, false);
+            guard.pass(tick as u32 * 25 * MS, false, Duration::ZERO);
+        }
+        assert!((guard.bound([9.0, 0.0, 0.0], false)[0] - 3.6).abs() < 1e-9);
+        assert_eq!(guard.bound([3.0, 0.0, 0.0], false)[0], 3.0);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0);
     }
 
     #[test]
@@ -326,7 +350,7 @@ mod tests {
         let mut guard = ran();
         (41..=44).for_each(|tick| guard.give(1900 * MS, tick, 3.0, false));
         guard.pass(1900 * MS, false, Duration::ZERO);
-        let shown = guard.bound([3.0, 0.0, 0.0])[0];
+        let shown = guard.bound([3.0, 0.0, 0.0], true)[0];
         assert!(shown < 0.01, "{shown}");
         // What a frame repeats may be from before the host stood still.
         let mut guard = ran();
@@ -355,15 +379,15 @@ mod tests {
         pass(&mut guard, Duration::ZERO, Duration::ZERO);
         guard.give(Duration::ZERO, 1, 1.0, false);
         guard.disturb(Duration::ZERO);
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "it has only just taken hold");
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0, "it has only just taken hold");
         for tick in 2..=60 {
             guard.give(tick as u32 * 25 * MS, tick, 1.0, false);
             pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
         }
         guard.disturb(1500 * MS);
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 1.2);
         (60..=101).for_each(|k| pass(&mut guard, k * 25 * MS, Duration::ZERO));
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0, "a second later");
     }
 
     #[test]
@@ -374,11 +398,11 @@ mod tests {
             pass(&mut guard, tick as u32 * 25 * MS, Duration::ZERO);
             guard.surprise(tick as u32 * 25 * MS, 0.049);
         }
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "no surprise");
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0, "no surprise");
         guard.surprise(1500 * MS, 0.051);
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2);
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 1.2);
         (60..=101).for_each(|k| pass(&mut guard, k * 25 * MS, Duration::ZERO));
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "a second later");
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0, "a second later");
     }
 
     #[test]
@@ -387,12 +411,12 @@ mod tests {
         guard.give(Duration::ZERO, 1, 1.0, false);
         pass(&mut guard, Duration::ZERO, Duration::ZERO);
         guard.prolong(Duration::ZERO);
-        assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 9.0, "without a hitch, nothing is prolonged");
+        assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0, "without a hitch, nothing is prolonged");
         for k in 5..=165 {
             guard.give(25 * k * MS, k.into(), 1.0, false);
             pass(&mut guard, 25 * k * MS, Duration::ZERO);
             guard.prolong(25 * k * MS);
-            assert_eq!(guard.bound([9.0, 0.0, 0.0])[0], 1.2, "{k}");
+            assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 1.2, "{k}");
         }
     }
 
@@ -400,7 +424,7 @@ mod tests {
     fn a_reaction_that_is_not_known_fades_and_returns_slowly() {
         let mut guard = HitchGuard::new(0.025);
         guard.give(Duration::ZERO, 1, 10.0, false);
-        let bounded = |guard: &HitchGuard| guard.bound([10.0, 0.0, 0.0])[0];
+        let bounded = |guard: &HitchGuard| guard.bound([10.0, 0.0, 0.0], true)[0];
         let mut last = 10.0;
         for k in 0..=70 {
             pass(&mut guard, 10 * k * MS, 10 * k * MS);

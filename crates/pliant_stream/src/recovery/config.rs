@@ -74,7 +74,7 @@ pub struct RecoveryConfig {
     /// [`super::PassivityGuard`]. Default: true.
     pub passive: bool,
     /// Time without a frame after which prediction ends. The body then stands still until a frame
-    /// arrives. Default: 0.4 s.
+    /// arrives. Default: 0.475 s.
     pub stall_after: Duration,
 }
 
@@ -91,7 +91,7 @@ impl Default for RecoveryConfig {
             snapshots: true,
             playout: Playout::Fixed(1),
             passive: true,
-            stall_after: Duration::from_millis(400),
+            stall_after: Duration::from_millis(475),
         }
     }
 }

@@ -198,11 +198,12 @@ impl StreamedBody {
     /// [`StreamedBody::predicted_hand`] if there is one.
     ///
     /// After a hitch of the host, the network or this guest, it exceeds what the host has sent in
-    /// the last second by no more than a fifth. Where no frame comes, it fades.
+    /// the last second by no more than a fifth, and until the host has told of the hand, what it
+    /// has ever sent. Where no frame comes, it fades.
     pub fn hand_reaction(&self, user: UserId, grab: u16) -> Option<[f64; 3]> {
-        let confirmed = || self.grabs().iter().find(|g| g.key == GrabKey { user, grab }).map(|g| g.reaction);
-        let reaction = self.predicted_hand().and_then(|own| own.reaction(grab)).or_else(confirmed)?;
-        Some(self.hitches.bound(reaction))
+        let confirmed = self.grabs().iter().find(|g| g.key == GrabKey { user, grab }).map(|g| g.reaction);
+        let reaction = self.predicted_hand().and_then(|own| own.reaction(grab)).or(confirmed)?;
+        Some(self.hitches.bound(reaction, confirmed.is_some()))
     }
 
     /// The rigid frame of a free body at the displayed tick.
@@ -459,11 +460,12 @@ impl StreamedBody {
             && self.receiver.as_ref().is_some_and(Receiver::is_fading)
             && self.pauses(now)
         {
-            // The schedule waits for a host that has paused. Corrections go on meanwhile.
+            // The schedule waits for a host that has paused. Corrections go on meanwhile, twice as
+            // fast as the body steps: it stands still, and is to be right when it goes on.
             if let Some(receiver) = &mut self.receiver {
                 receiver.fade();
             }
-            self.fade_at = now + Duration::from_secs_f64(self.newmark.h);
+            self.fade_at = now + Duration::from_secs_f64(0.5 * self.newmark.h);
         }
         let waits = self.snapshot.is_some();
         if self.config.snapshots && !waits && self.receiver.as_ref().is_some_and(Receiver::wants_snapshot) {

@@ -315,8 +315,8 @@ impl HostSession {
                 self.drop_peer(id, DisconnectReason::Silent, true);
                 continue;
             }
-            let (bytes, round_trip) = (p.link.stats.bytes_out, p.link.least_round_trip());
-            p.regulator.judge(now, bytes, round_trip, self.config.guest_rate);
+            let (bytes, round_trips) = (p.link.stats.bytes_out, p.link.last_round_trips());
+            p.regulator.judge(now, bytes, round_trips, self.config.guest_rate);
             p.link.stats.level = p.regulator.level();
             p.link.updated(now);
         }

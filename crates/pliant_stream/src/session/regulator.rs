@@ -2,12 +2,20 @@
 
 use std::time::Duration;
 
+use crate::link::JUDGED;
 use crate::wire::{Payload, StreamSubscription};
 
 /// Length of the window over which the stream is judged.
 const WINDOW: Duration = Duration::from_secs(1);
-/// Excess of the round trip over its minimum that indicates a queue, s.
+/// Excess of round trips over their minimum that indicates a queue, s, where they do not scatter.
 const QUEUE: f64 = 0.05;
+/// Where they scatter, they exceed it by more: by so many times the mean excess of the last
+/// windows, of which no more than this is counted, s, since a queue is no scatter.
+const SCATTER: f64 = 3.0;
+const MOST_SCATTER: f64 = 0.07;
+const WINDOWS: f64 = 16.0;
+/// Windows without scatter that are taken to have been before the first.
+const QUIET: f64 = 3.0;
 /// Number of quiet windows before the level is lowered again. It doubles each time that lowering it
 /// was too much.
 const PATIENCE: u32 = 5;
@@ -21,20 +29,31 @@ pub(crate) struct Regulator {
     since: Option<(Duration, u64)>,
     least: f64,
     last: f64,
+    scatter: f64,
+    windows: f64,
     calm: u32,
     patience: u32,
 }
 
 impl Default for Regulator {
     fn default() -> Self {
-        Self { level: 0, since: None, least: 3600.0, last: 0.0, calm: 0, patience: PATIENCE }
+        Self {
+            level: 0,
+            since: None,
+            least: 3600.0,
+            last: 0.0,
+            scatter: 0.0,
+            windows: QUIET,
+            calm: 0,
+            patience: PATIENCE,
+        }
     }
 }
 
 impl Regulator {
-    /// Judges the last window. `bytes` is the total sent so far, `round_trip` the smaller of the
-    /// last two unsmoothed round trips, and `rate` the allowed rate in bit/s.
-    pub(crate) fn judge(&mut self, now: Duration, bytes: u64, round_trip: Duration, rate: f64) {
+    /// Judges the last window. `bytes` is the total sent so far, `round_trips` are the last
+    /// unsmoothed ones, and `rate` is the allowed rate in bit/s.
+    pub(crate) fn judge(&mut self, now: Duration, bytes: u64, round_trips: [Duration; JUDGED], rate: f64) {
         let (from, before) = *self.since.get_or_insert((now, bytes));
         let passed = now.saturating_sub(from);
         if passed < WINDOW {
@@ -42,15 +61,21 @@ impl Regulator {
         }
         self.since = Some((now, bytes));
         let bits = 8.0 * bytes.saturating_sub(before) as f64 / passed.as_secs_f64();
-        let round_trip = round_trip.as_secs_f64();
+        let [.., newest] = round_trips.map(|t| t.as_secs_f64());
+        let round_trip = round_trips.into_iter().min().unwrap_or_default().as_secs_f64();
         if round_trip > 0.0 {
             // The minimum is forgotten within a minute, since routes also change to longer ones.
             self.least = round_trip.min(self.least + 0.02 * (round_trip - self.least).clamp(0.0, 1.0));
         }
         // A queue that shrinks by a third in a second is already being resolved.
         let excess = round_trip - self.least;
-        let queued = excess > QUEUE && excess > 0.7 * self.last;
+        let queued = excess > QUEUE + SCATTER * self.scatter && excess > 0.7 * self.last;
         self.last = excess;
+        if round_trip > 0.0 {
+            self.windows = (self.windows + 1.0).min(WINDOWS);
+            let scatter = (newest - self.least).clamp(0.0, MOST_SCATTER);
+            self.scatter += (scatter - self.scatter) / self.windows;
+        }
         if bits > rate || queued {
             if self.calm > 0 && self.calm < self.patience {
                 // The level was lowered recently, and that was too much.
