@@ -328,26 +328,26 @@ fn what_a_scene_leaves_out_is_what_was_measured() {
     };
     for (before, scene, column) in [
         ("a body with a window", "solo", "crates"),
-        ("a body with a window 324, a host without a picture", "host", "crates"),
-        ("a host without a picture 214, a guest", "guest", "crates"),
-        ("a guest 358, a body with a haptic device", "haptics", "crates"),
-        ("a haptic device 344, everything", "everything", "crates"),
+        ("a body with a window 327, a host without a picture", "host", "crates"),
+        ("a host without a picture 216, a guest", "guest", "crates"),
+        ("a guest 361, a body with a haptic device", "haptics", "crates"),
+        ("a haptic device 347, everything", "everything", "crates"),
         ("`PliantPlugins` adds", "solo", "systems"),
-        ("`PliantPlugins` adds 20 to the engine's", "solo", "engine_systems"),
+        ("`PliantPlugins` adds 36 to the engine's", "solo", "engine_systems"),
         ("drawn by the processor take", "many", "work_frame_ms"),
         ("a host without a picture is", "host", "program_mb"),
-        ("31 MB, and takes", "host", "rest_frame_ms"),
-        ("0.15 ms for a frame at rest and", "host", "work_frame_ms"),
+        ("43 MB, and takes", "host", "rest_frame_ms"),
+        ("0.60 ms for a frame at rest and", "host", "work_frame_ms"),
         ("A program with a window is", "solo", "program_mb"),
-        ("89 MB, and one with everything", "everything", "program_mb"),
+        ("104 MB, and one with everything", "everything", "program_mb"),
     ] {
         says(MEASUREMENTS, before, of(scene, column));
     }
     let more = |scene| of(scene, "work_frame_ms") - of(scene, "rest_frame_ms");
     says(MEASUREMENTS, "In motion, one body adds", more("solo"));
-    says(MEASUREMENTS, "0.16 ms, a guest's body", more("guest"));
-    says(MEASUREMENTS, "0.21 ms, everything together", more("everything"));
+    says(MEASUREMENTS, "0.38 ms, a guest's body", more("guest"));
+    says(MEASUREMENTS, "0.63 ms, everything together", more("everything"));
     says(DECISIONS, "A body with a window compiles", of("solo", "crates"));
-    says(DECISIONS, "324 crates, a host without a picture", of("host", "crates"));
-    says(DECISIONS, "214, and everything together", of("everything", "crates"));
+    says(DECISIONS, "327 crates, a host without a picture", of("host", "crates"));
+    says(DECISIONS, "216, and everything together", of("everything", "crates"));
 }
