@@ -138,8 +138,8 @@ impl Link {
     }
 
     /// Adds a round trip that this side or the other side measured. The datagrams have `waited` for
-    /// some part of it at most, because a process stood still. Such a sample is taken for as long as
-    /// the path is known to be, where that is possible.
+    /// some part of it at most, because a process stood still. Such a sample is taken for as long
+    /// as the path is known to be, where that is possible.
     pub(crate) fn sample_round_trip(&mut self, sample: Duration, waited: Duration) {
         let known = self.round_trip().filter(|_| !waited.is_zero());
         let sample = known.map_or(sample, |known| known.clamp(sample.saturating_sub(waited), sample));

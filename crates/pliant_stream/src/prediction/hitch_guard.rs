@@ -8,8 +8,8 @@
 //! second of this guest's time, until the host has the hand where this guest sent it. The same
 //! holds for a second after another's hand has come or gone, after a jump of the hand itself, and
 //! after an event that has changed what the copy predicts by more than a twentieth of that measure.
-//! It also holds where frames are due and none comes, and if it lasts, the reaction fades. A hand of
-//! which the host has not told yet may have taken hold of a body that swings, at another moment
+//! It also holds where frames are due and none comes, and if it lasts, the reaction fades. A hand
+//! of which the host has not told yet may have taken hold of a body that swings, at another moment
 //! than here: it is displayed no more than a fifth beyond the largest reaction of all times.
 
 use std::collections::VecDeque;
