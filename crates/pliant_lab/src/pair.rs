@@ -111,8 +111,8 @@ struct Direction {
     reliable: EmulatedLink,
     /// Sent by an app whose network stands still.
     sent: Waiting<Vec<u8>>,
-    /// Received for an app that stands still.
-    received: Waiting<Vec<u8>>,
+    /// Received for an app that may stand still, with the times of arrival.
+    received: Waiting<(Duration, Vec<u8>)>,
 }
 
 impl Direction {
@@ -153,11 +153,11 @@ impl Direction {
         // An app that runs reads at once.
         let most = if to.app { WAITING } else { usize::MAX };
         while let Some(bytes) = (!partitioned).then(|| self.reliable.poll(now)).flatten() {
-            self.received.push(Channel::Message, bytes, most);
+            self.received.push(Channel::Message, (now, bytes), most);
         }
         while let Some(bytes) = datagrams.poll(now) {
             if !partitioned {
-                self.received.push(Channel::Datagram, bytes, most);
+                self.received.push(Channel::Datagram, (now, bytes), most);
             }
         }
     }
@@ -444,23 +444,24 @@ impl Pair {
             g.to_guest.pass(&mut g.down, [self.stalled, g.stalled], g.partitioned, now);
             // Messages come first, so that a snapshot is handled before a frame of the same arrival
             // time.
-            while let Some((channel, bytes)) = (!self.stalled.app).then(|| g.to_host.received.pop()).flatten()
+            while let Some((channel, (at, bytes))) =
+                (!self.stalled.app).then(|| g.to_host.received.pop()).flatten()
             {
                 match channel {
                     _ if !(g.connected || g.lingers) || g.lost => {}
                     Channel::Message => self.host.on_message(host_now, peer, &bytes),
-                    Channel::Datagram => self.host.on_datagram(host_now, peer, &bytes),
+                    Channel::Datagram => self.host.on_datagram(at + self.ahead, peer, &bytes),
                 }
             }
             if g.stalled.app {
                 continue;
             }
             let began = self.clock.map(|c| c());
-            while let Some((channel, bytes)) = g.to_guest.received.pop() {
+            while let Some((channel, (at, bytes))) = g.to_guest.received.pop() {
                 match channel {
                     _ if !g.connected => {}
                     Channel::Message => g.session.on_message(now + g.ahead, &bytes),
-                    Channel::Datagram => g.session.on_datagram(now + g.ahead, &bytes),
+                    Channel::Datagram => g.session.on_datagram(at + g.ahead, &bytes),
                 }
             }
             if let (Some(clock), Some(began)) = (self.clock, began) {

@@ -137,6 +137,30 @@ fn a_path_whose_round_trip_scatters_is_not_taken_for_one_with_a_queue() {
 }
 
 #[test]
+fn a_short_queue_that_stands_is_no_scatter() {
+    let model = bar(120, 0.05);
+    // The path has a buffer of 150 ms, and drops what is beyond.
+    let down =
+        LinkConfig { delay: 20 * MS, bits_per_second: Some(55e3), queue_bytes: 1000, ..Default::default() };
+    let (mut pair, mut scene) = start(&model);
+    scene.hand = circling();
+    let path = PathConfig {
+        up: LinkConfig { bits_per_second: None, queue_bytes: usize::MAX, ..down.clone() },
+        ..PathConfig::symmetric(down)
+    };
+    pair.join_with(GuestSessionConfig::default(), path, 5, cached(&model)).unwrap();
+    let mut cut = 0;
+    for second in 1..=60 {
+        pair.run_until(second * S, &mut scene);
+        let stats = pair.host.stats(PeerId(1)).unwrap();
+        cut += u32::from(stats.level > 0);
+    }
+    // The host looks for more now and then.
+    println!("cut for {cut} of 60 s, lost {:.3}", pair.host.stats(PeerId(1)).unwrap().loss_out);
+    assert!(cut > 40, "cut for {cut} of 60 s");
+}
+
+#[test]
 fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
     let model = bar(120, 0.05);
     for (rate, link) in [

@@ -388,7 +388,8 @@ fn session(play: Play, model: &Arc<ModalModel>, who: Who, seed: u64, lasts: Dura
         outcome.truth = given.iter().map(|g| g.force).fold(outcome.truth, f64::max);
         let played = given.last().map_or(0, |given| given.input);
         // What the host has not played when the session ends is compared with nothing.
-        for shown in seen.shown.iter().filter(|shown| shown.input <= played) {
+        let ends = given.last().map_or(Duration::ZERO, |given| given.at.saturating_sub(2 * S));
+        for shown in seen.shown.iter().filter(|shown| shown.input <= played || shown.at < ends) {
             let from = given.partition_point(|g| g.at + S < shown.at);
             let to = given.partition_point(|g| g.at <= shown.at || g.input < shown.input) + 1 + FADED;
             let to = to.min(given.len());

@@ -257,7 +257,7 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
     );
     let words = "Each line is a way of repair, over the loss of the paper's four networks, whose round trips differ, too (196, 120, 60 and 20 ms from the worst to the best). All have the same playout delay of one tick and the same three repeats, but peers have no playout delay. The table has what each sends.";
     let time = "The figure shows the same error over the processor time of a tick at the receiver, with a point for each network. The time includes decoding, correcting and stepping 60 modes, and between peers also the peer's own hands. It is the time of the thread itself on one core, the shortest of three runs. Differences below a fifth mean nothing.";
-    let jitter = "The figure shows the paper's worst network (9 % loss, 196 ms) without jitter, and with an extra delay of exponential distribution whose mean is 10 and 30 ms. All have the same playout delay and repeats. A path whose round trip scatters is taken for one with a queue, so that the host sends less at 30 ms.";
+    let jitter = "The figure shows the paper's worst network (9 % loss, 196 ms) without jitter, and with an extra delay of exponential distribution whose mean is 10 and 30 ms. All have the same playout delay and repeats.";
     let burst = "The figure shows the same network by the mean length of a burst: 1 is random loss, and 4 and 12 are bursts of a Gilbert-Elliott path. The loss is 9 % in all cases.";
     let figures = [
         ("f-network", "loss on the paper's four networks", "loss, %", Axes::LogarithmicError, words),

@@ -22,7 +22,7 @@ use tally::{DatagramArrival, Tally, loss_of};
 /// Number of round trips by which a queue is judged.
 pub(crate) const JUDGED: usize = 3;
 /// Pause between two updates beyond which what comes next may have waited here.
-const STOOD_STILL: Duration = Duration::from_millis(45);
+pub(crate) const STOOD_STILL: Duration = Duration::from_millis(45);
 
 /// State of a connection: sequence numbers, loss, round trip, time of the last reception, and
 /// counts.
@@ -38,6 +38,8 @@ pub(crate) struct Link {
     round_trip: RoundTrip,
     /// Unsmoothed, the newest last.
     last_round_trips: [Duration; JUDGED],
+    /// The last one, until the other side is told.
+    measured: Option<Duration>,
     /// Counts, and values that only one role measures. [`Link::stats`] adds the other values.
     pub(crate) stats: LinkStats,
 }
@@ -53,6 +55,7 @@ impl Link {
             received: Tally::default(),
             round_trip: RoundTrip::default(),
             last_round_trips: [Duration::ZERO; JUDGED],
+            measured: None,
             stats: LinkStats::default(),
         }
     }
@@ -62,13 +65,14 @@ impl Link {
         self.received_at = now;
     }
 
-    /// Notes the time of an update, before which everything that had come was processed.
+    /// Notes the time of an update, which comes after what has arrived was processed.
     pub(crate) fn updated(&mut self, now: Duration) {
         self.updated_at = now;
     }
 
-    /// Time that a datagram which is processed `now` has waited here at most, because this process
-    /// stood still; zero where it did not.
+    /// Time that a datagram which arrives `now` may have waited for this process, which stood still
+    /// since the last update; zero where it did not. Those who know the time of each arrival need
+    /// this only where their own network stood still, too.
     pub(crate) fn waited(&self, now: Duration) -> Duration {
         let waited = now.saturating_sub(self.updated_at);
         if waited > STOOD_STILL { waited } else { Duration::ZERO }
@@ -131,9 +135,11 @@ impl Link {
         self.stats.loss_out = loss_of(report);
     }
 
-    /// Returns a clock exchange with the report and the last round trip, without timestamps.
-    pub(crate) fn clock(&self) -> Clock {
-        let round_trip = u32::try_from(micros(self.last_round_trips[JUDGED - 1])).unwrap_or(u32::MAX);
+    /// Returns a clock exchange with the report, and the round trip that was measured since the
+    /// last one, without timestamps.
+    pub(crate) fn clock(&mut self) -> Clock {
+        let round_trip = std::mem::take(&mut self.measured).map_or(0, micros);
+        let round_trip = u32::try_from(round_trip).unwrap_or(u32::MAX);
         Clock { report: self.received.report(), round_trip, ..Clock::default() }
     }
 
@@ -146,6 +152,7 @@ impl Link {
         self.round_trip.sample(sample);
         self.last_round_trips.rotate_left(1);
         self.last_round_trips[JUDGED - 1] = sample;
+        self.measured = Some(sample);
     }
 
     /// The smoothed round trip; `None` before the first measurement.

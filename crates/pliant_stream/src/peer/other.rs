@@ -107,6 +107,8 @@ pub(super) struct RemotePeer {
     pub(super) theirs: Option<f64>,
     /// The newest tick that the other peer has sent.
     pub(super) newest: Tick,
+    /// When it has sent that.
+    pub(super) told_at: Duration,
     pub(super) requested: BTreeMap<Tick, Duration>,
     /// Number of consecutive checks that disagreed, per body.
     pub(super) mismatched: BTreeMap<BodyId, u32>,
@@ -142,6 +144,7 @@ impl RemotePeer {
             ahead: None,
             theirs: None,
             newest: 0,
+            told_at: Duration::ZERO,
             requested: BTreeMap::new(),
             mismatched: BTreeMap::new(),
             lost: false,

@@ -283,6 +283,7 @@ impl PeerSession {
             Datagram::Inputs(Inputs { now: theirs, ahead: seen, ticks, check }) => {
                 other.theirs = seen.or(other.theirs);
                 other.newest = theirs;
+                other.told_at = now;
                 other.came(now, theirs as f64 * self.config.step);
                 let sample = self.tick as f64 - theirs as f64;
                 if sample.abs() < WINDOW as f64 {

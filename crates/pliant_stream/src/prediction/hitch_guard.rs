@@ -29,8 +29,10 @@ const PAUSES: f64 = 2.0;
 /// Factor by which a usual pause grows at most, and is forgotten, from one call to the next.
 const GROWING: f64 = 1.5;
 const FORGETTING: f64 = 0.98;
-/// Ticks without a frame from which on the bound applies until one comes.
-const WAITS: f64 = 2.5;
+/// A pause in the frames from which on the bound applies, until one comes and for
+/// [`PROLONGED`] after it: at least this long, and at least so many ticks.
+const WAITS: Duration = Duration::from_millis(60);
+const WAITS_TICKS: f64 = 2.5;
 /// How long the bound applies after a hitch, and how long a reaction counts that the host has made.
 const AFTER: Duration = Duration::from_secs(1);
 /// How long it applies at least after the host has found the hand again.
@@ -60,7 +62,7 @@ struct Given {
 pub(crate) struct HitchGuard {
     /// What the host has sent for each tick of the last second of the body.
     given: VecDeque<Given>,
-    /// The largest reaction that the host has ever sent, N.
+    /// The largest reaction that the host has ever sent of hands that held for half a second, N.
     largest: f64,
     /// Time that a frame is on its way.
     way: Duration,
@@ -68,8 +70,6 @@ pub(crate) struct HitchGuard {
     /// The usual time between two calls of late.
     usual: Duration,
     bounded_until: Duration,
-    /// Whether frames are due and none comes.
-    waits: bool,
     /// Share of the reaction that is displayed, 0 to 1.
     share: f64,
     hitch: Duration,
@@ -88,7 +88,6 @@ impl HitchGuard {
             called: None,
             usual: Duration::ZERO,
             bounded_until: Duration::ZERO,
-            waits: false,
             share: 1.0,
             hitch: HITCH.max(Duration::from_secs_f64(4.0 * h)),
             h: Duration::from_secs_f64(h),
@@ -99,7 +98,10 @@ impl HitchGuard {
     /// Keeps the largest reaction (N) of the guest's hands at a tick whose frame has arrived, or
     /// that a later frame `repeats`.
     pub(crate) fn give(&mut self, now: Duration, tick: Tick, reaction: f64, repeats: bool) {
-        self.largest = self.largest.max(reaction);
+        // A touch says little of how hard the next hand pulls.
+        if self.knows() {
+            self.largest = self.largest.max(reaction);
+        }
         // A host that began anew goes on at an earlier tick, and what was given later is another's.
         while self.given.back().is_some_and(|last| last.tick >= tick) {
             self.given.pop_back();
@@ -138,7 +140,9 @@ impl HitchGuard {
         let quiet = self.given.back().map_or(Duration::ZERO, |last| now.saturating_sub(last.at));
         let passed = self.called.map_or(Duration::ZERO, |called| now.saturating_sub(called));
         self.called = Some(now);
-        self.waits = quiet > self.h.mul_f64(WAITS) && self.knows();
+        if quiet > WAITS.max(self.h.mul_f64(WAITS_TICKS)) && self.knows() {
+            self.bounded_until = self.bounded_until.max(now + PROLONGED);
+        }
         let paused = passed > PAUSE.max(self.usual.mul_f64(PAUSES)) && self.most() > 0.0;
         if paused || passed > self.hitch || quiet > self.hitch {
             self.bounded_until = now + AFTER;
@@ -208,7 +212,7 @@ impl HitchGuard {
             reaction = reaction.cap_magnitude(BEYOND * self.largest);
         }
         let bounded = self.called.is_some_and(|now| now < self.bounded_until);
-        if !bounded && !self.waits {
+        if !bounded {
             return reaction.into();
         }
         reaction.cap_magnitude(BEYOND * self.most()).into()
@@ -314,7 +318,21 @@ mod tests {
         assert!((shown(&guard) - 3.6).abs() < 1e-9, "{}", shown(&guard));
         guard.give(1075 * MS, 43, 1.0, false);
         guard.pass(1075 * MS, false, Duration::ZERO);
+        assert!((shown(&guard) - 3.6).abs() < 1e-9, "and not at once: {}", shown(&guard));
+        for tick in 44..=53 {
+            guard.give(25 * tick as u32 * MS, tick, 1.0, false);
+            guard.pass(25 * tick as u32 * MS, false, Duration::ZERO);
+        }
         assert_eq!(shown(&guard), 9.0);
+        // A host of sixty frames a second sends four ticks of 1/240 s at once.
+        let mut guard = HitchGuard::new(1.0 / 240.0);
+        for ms in (0..3000).step_by(5) {
+            if ms % 17 == 0 {
+                (1..=4).for_each(|k| guard.give(ms * MS, u64::from(ms) * 4 / 17 + k, 1.0, false));
+            }
+            guard.pass(ms * MS, false, Duration::ZERO);
+            assert_eq!(shown(&guard), 9.0, "{ms}");
+        }
         // A hand that has only just taken hold has no measure.
         let mut guard = HitchGuard::new(0.025);
         guard.give(Duration::ZERO, 1, 1.0, false);
@@ -326,11 +344,16 @@ mod tests {
     fn a_hand_that_the_host_has_not_told_of_is_bounded_by_all_before() {
         let mut guard = HitchGuard::new(0.025);
         assert_eq!(guard.bound([9.0, 0.0, 0.0], false)[0], 9.0, "the first hand has no measure");
-        guard.give(25 * MS, 1, 3.0, false);
-        for tick in 2..=100 {
-            guard.give(tick as u32 * 25 * MS, tick, 0.0, false);
-            guard.pass(tick as u32 * 25 * MS, false, Duration::ZERO);
-        }
+        let mut give = |from: u64, to: u64, reaction: f64| {
+            for tick in from..=to {
+                guard.give(tick as u32 * 25 * MS, tick, reaction, false);
+                guard.pass(tick as u32 * 25 * MS, false, Duration::ZERO);
+            }
+        };
+        give(1, 10, 0.1);
+        give(11, 60, 0.0);
+        give(61, 100, 3.0);
+        give(101, 200, 0.0);
         assert!((guard.bound([9.0, 0.0, 0.0], false)[0] - 3.6).abs() < 1e-9);
         assert_eq!(guard.bound([3.0, 0.0, 0.0], false)[0], 3.0);
         assert_eq!(guard.bound([9.0, 0.0, 0.0], true)[0], 9.0);

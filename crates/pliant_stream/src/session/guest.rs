@@ -14,7 +14,7 @@ use super::guest_hands::LocalGrab;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
-use crate::link::{Budget, Events, Link, micros};
+use crate::link::{Budget, Events, Link, STOOD_STILL, micros};
 use crate::newmark::Newmark;
 use crate::state::{BodyId, PeerId, UserId, UserInfo, UserLinkInfo};
 use crate::wire::{
@@ -240,13 +240,12 @@ impl GuestSession {
             }
             Datagram::Pong(clock) => {
                 self.link.take_report(clock.report);
-                // The host's clock is compared when the host processed the request, since nobody
-                // knows when a request that waited there has come.
-                if let Some(waited) = clock.t3.checked_sub(clock.t2)
-                    && let Some(rtt) = self.clock.sample(clock.t1, clock.t3, clock.t3, micros(now))
-                {
-                    let waited = Duration::from_micros(waited).saturating_add(self.link.waited(now));
-                    self.link.sample_round_trip(rtt, waited);
+                // The request has come at t2, or later if the host stood still: then nobody knows.
+                let Some(spent) = clock.t3.checked_sub(clock.t2).map(Duration::from_micros) else { return };
+                let (t2, waited) =
+                    if spent > STOOD_STILL { (clock.t3, spent) } else { (clock.t2, Duration::ZERO) };
+                if let Some(rtt) = self.clock.sample(clock.t1, t2, clock.t3, micros(now)) {
+                    self.link.sample_round_trip(rtt, waited.saturating_add(self.link.waited(now)));
                 }
             }
             _ => self.link.reject(),

@@ -462,10 +462,14 @@ impl StreamedBody {
         {
             // The schedule waits for a host that has paused. Corrections go on meanwhile, twice as
             // fast as the body steps: it stands still, and is to be right when it goes on.
-            if let Some(receiver) = &mut self.receiver {
+            let half = Duration::from_secs_f64(0.5 * self.newmark.h);
+            self.fade_at = self.fade_at.max(now.saturating_sub(4 * half));
+            while let Some(receiver) = &mut self.receiver
+                && self.fade_at <= now
+            {
                 receiver.fade();
+                self.fade_at += half;
             }
-            self.fade_at = now + Duration::from_secs_f64(0.5 * self.newmark.h);
         }
         let waits = self.snapshot.is_some();
         if self.config.snapshots && !waits && self.receiver.as_ref().is_some_and(Receiver::wants_snapshot) {
@@ -477,7 +481,7 @@ impl StreamedBody {
     /// Ticks that may be shown beyond the newest received one. After a pause of the host, there are
     /// none until the schedule knows how long the pause was.
     fn guesses(&self) -> u64 {
-        let most = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
+        let most = (self.config.stall_after.as_secs_f64() / self.newmark.h).round() as u64 + 1;
         if self.waits_for > 0 { 0 } else { most }
     }
 

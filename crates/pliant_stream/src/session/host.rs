@@ -318,6 +318,7 @@ impl HostSession {
             let (bytes, round_trips) = (p.link.stats.bytes_out, p.link.last_round_trips());
             p.regulator.judge(now, bytes, round_trips, self.config.guest_rate);
             p.link.stats.level = p.regulator.level();
+            p.send_pong(now, &mut self.out);
             p.link.updated(now);
         }
         self.send_models(now);

@@ -64,6 +64,8 @@ pub(crate) struct GuestPeer {
     pub(crate) interest: BTreeMap<BodyId, u16>,
     pub(crate) grabs: BTreeMap<u16, AnnouncedGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
+    /// The last clock request: the guest's stamp, and the time at which it came at the earliest.
+    ping: Option<(u64, Duration)>,
     /// Bytes of messages that the transport has accepted and not sent, as last reported.
     pub(crate) unsent: usize,
     /// What the guest may ask of the host. This outlives the connection.
@@ -90,6 +92,7 @@ impl GuestPeer {
             interest: BTreeMap::new(),
             grabs: BTreeMap::new(),
             resends: VecDeque::new(),
+            ping: None,
             unsent: 0,
             budgets: GuestBudgets::new(model_rate),
             share: SharedBudgets::of_one(now),
@@ -119,10 +122,15 @@ impl GuestPeer {
         true
     }
 
-    /// Answers a clock request that is processed, and answered, at `now`.
-    pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, out: &mut VecDeque<Output>) {
-        let t2 = micros(now.saturating_sub(self.link.waited(now)));
-        let clock = Clock { t1, t2, t3: micros(now), round_trip: 0, ..self.link.clock() };
+    /// Takes a clock request that has come `at` a time, and the stamp of the guest's clock in it.
+    pub(crate) fn take_ping(&mut self, at: Duration, t1: u64) {
+        self.ping = Some((t1, at.saturating_sub(self.link.waited(at))));
+    }
+
+    /// Answers the last clock request.
+    pub(crate) fn send_pong(&mut self, now: Duration, out: &mut VecDeque<Output>) {
+        let Some((t1, came)) = self.ping.take() else { return };
+        let clock = Clock { t1, t2: micros(came), t3: micros(now), ..self.link.clock() };
         self.link.send_datagram(|sequence| Datagram::Pong(clock).encode(sequence), out);
     }
 

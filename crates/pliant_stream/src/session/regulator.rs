@@ -9,9 +9,10 @@ use crate::wire::{Payload, StreamSubscription};
 const WINDOW: Duration = Duration::from_secs(1);
 /// Excess of round trips over their minimum that indicates a queue, s, where they do not scatter.
 const QUEUE: f64 = 0.05;
-/// Where they scatter, they exceed it by more: by so many times the mean excess of the last
-/// windows, of which no more than this is counted, s, since a queue is no scatter.
-const SCATTER: f64 = 3.0;
+/// Where they scatter, they exceed it by more: by so many times the mean excess of the newest over
+/// the smallest of the last ones, of which no more than this is counted, s. A queue that stands
+/// lengthens all, and is no scatter.
+const SCATTER: f64 = 2.5;
 const MOST_SCATTER: f64 = 0.07;
 const WINDOWS: f64 = 16.0;
 /// Windows without scatter that are taken to have been before the first.
@@ -73,7 +74,7 @@ impl Regulator {
         self.last = excess;
         if round_trip > 0.0 {
             self.windows = (self.windows + 1.0).min(WINDOWS);
-            let scatter = (newest - self.least).clamp(0.0, MOST_SCATTER);
+            let scatter = (newest - round_trip).clamp(0.0, MOST_SCATTER);
             self.scatter += (scatter - self.scatter) / self.windows;
         }
         if bits > rate || queued {

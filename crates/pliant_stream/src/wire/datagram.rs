@@ -70,14 +70,13 @@ pub struct ReceiverReport {
 pub struct Clock {
     /// Guest's clock when the guest sends, us.
     pub t1: u64,
-    /// Host's clock when the host received at the earliest, us. It is `t3` unless the host stood
-    /// still.
+    /// Host's clock when the host received at the earliest, us.
     pub t2: u64,
     /// Host's clock when the host sends, us.
     pub t3: u64,
     /// Report on what the sender of this datagram has received.
     pub report: ReceiverReport,
-    /// The last round trip that the guest measured, us; 0 before the first.
+    /// The round trip that the guest has measured since its last request, us; 0 if none.
     pub round_trip: u32,
 }
 

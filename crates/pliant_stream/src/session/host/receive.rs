@@ -78,7 +78,7 @@ impl HostSession {
                     let sample = Duration::from_micros(u64::from(clock.round_trip));
                     p.link.sample_round_trip(sample, Duration::ZERO);
                 }
-                p.send_pong(now, clock.t1, &mut self.out);
+                p.take_ping(now, clock.t1);
             }
             _ => p.link.reject(),
         }
