@@ -33,6 +33,8 @@ pub(crate) struct Link {
     pub(crate) max_datagram: usize,
     received_at: Duration,
     updated_at: Duration,
+    /// The update before the last one, if this process stood still between the two.
+    stood_since: Option<Duration>,
     sequence: u16,
     received: Tally,
     round_trip: RoundTrip,
@@ -51,6 +53,7 @@ impl Link {
             max_datagram,
             received_at: now,
             updated_at: now,
+            stood_since: None,
             sequence: 0,
             received: Tally::default(),
             round_trip: RoundTrip::default(),
@@ -67,14 +70,16 @@ impl Link {
 
     /// Notes the time of an update, which comes after what has arrived was processed.
     pub(crate) fn updated(&mut self, now: Duration) {
+        let stood = now.saturating_sub(self.updated_at) > STOOD_STILL;
+        self.stood_since = stood.then_some(self.updated_at);
         self.updated_at = now;
     }
 
     /// Time that a datagram which arrives `now` may have waited for this process, which stood still
-    /// since the last update; zero where it did not. Those who know the time of each arrival need
-    /// this only where their own network stood still, too.
+    /// before; zero where it did not. Those who know the time of each arrival need this only where
+    /// their own network stood still, too. It may be read one update after the process went on.
     pub(crate) fn waited(&self, now: Duration) -> Duration {
-        let waited = now.saturating_sub(self.updated_at);
+        let waited = now.saturating_sub(self.stood_since.unwrap_or(self.updated_at));
         if waited > STOOD_STILL { waited } else { Duration::ZERO }
     }
 

@@ -10,7 +10,8 @@
 //! after an event that has changed what the copy predicts by more than a twentieth of that measure.
 //! It also holds where frames are due and none comes, and if it lasts, the reaction fades. A hand
 //! of which the host has not told yet may have taken hold of a body that swings, at another moment
-//! than here: it is displayed no more than a fifth beyond the largest reaction of all times.
+//! than here: it is displayed no more than a fifth beyond the largest reaction of all hands that
+//! have held for half a second.
 
 use std::collections::VecDeque;
 use std::time::Duration;

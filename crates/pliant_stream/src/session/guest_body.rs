@@ -199,7 +199,7 @@ impl StreamedBody {
     ///
     /// After a hitch of the host, the network or this guest, it exceeds what the host has sent in
     /// the last second by no more than a fifth, and until the host has told of the hand, what it
-    /// has ever sent. Where no frame comes, it fades.
+    /// has ever sent of hands that held for half a second. Where no frame comes, it fades.
     pub fn hand_reaction(&self, user: UserId, grab: u16) -> Option<[f64; 3]> {
         let confirmed = self.grabs().iter().find(|g| g.key == GrabKey { user, grab }).map(|g| g.reaction);
         let reaction = self.predicted_hand().and_then(|own| own.reaction(grab)).or(confirmed)?;
@@ -453,6 +453,10 @@ impl StreamedBody {
                 }
                 self.hitches.surprise(now, predicted.surprise());
             }
+        }
+        if self.receiver.as_ref().is_some_and(|receiver| !receiver.is_fading()) {
+            // A correction that begins after a pause does not catch up on the pause.
+            self.fade_at = self.fade_at.max(now);
         }
         if stepped > 0 {
             self.fade_at = now + Duration::from_secs_f64(self.newmark.h);

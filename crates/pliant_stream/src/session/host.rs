@@ -329,7 +329,7 @@ impl HostSession {
         let each = self.peers.values().flat_map(|p| {
             let model = self.upload.ready_at(p);
             let resend = p.resends.iter().map(|r| r.0).min();
-            [Some(p.link.silent_at(self.config.idle_timeout)), model, resend]
+            [Some(p.link.silent_at(self.config.idle_timeout)), model, resend, p.asked_at()]
         });
         each.flatten().min()
     }

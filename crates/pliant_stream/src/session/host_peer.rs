@@ -127,6 +127,11 @@ impl GuestPeer {
         self.ping = Some((t1, at.saturating_sub(self.link.waited(at))));
     }
 
+    /// When the clock request came that waits for the next update.
+    pub(crate) fn asked_at(&self) -> Option<Duration> {
+        self.ping.map(|(_, came)| came)
+    }
+
     /// Answers the last clock request.
     pub(crate) fn send_pong(&mut self, now: Duration, out: &mut VecDeque<Output>) {
         let Some((t1, came)) = self.ping.take() else { return };

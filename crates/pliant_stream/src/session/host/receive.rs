@@ -73,7 +73,7 @@ impl HostSession {
             }
             Datagram::Ping(clock) => {
                 p.link.take_report(clock.report);
-                // Zero means that the guest has not measured a round trip yet.
+                // Zero means that the guest has measured none since its last request.
                 if clock.round_trip > 0 {
                     let sample = Duration::from_micros(u64::from(clock.round_trip));
                     p.link.sample_round_trip(sample, Duration::ZERO);
