@@ -220,6 +220,25 @@ fn a_stall_does_not_lengthen_the_round_trip() {
 }
 
 #[test]
+fn a_guest_may_guess_for_ever_or_not_at_all() {
+    for stall_after in [Duration::ZERO, Duration::MAX] {
+        let model = bar(20, 0.05);
+        let (mut pair, mut scene) = start(&model);
+        scene.hand = circling();
+        let recovery = RecoveryConfig { stall_after, ..Default::default() };
+        let config = GuestSessionConfig { recovery, ..Default::default() };
+        pair.join_with(config, paper1(), 1, cached(&model)).unwrap();
+        pair.run_until(4 * S, &mut scene);
+        pair.stall_host(true);
+        pair.run_until(6 * S, &mut scene);
+        pair.stall_host(false);
+        pair.run_until(10 * S, &mut scene);
+        let off = scene.error(&pair.guests[0].session) / scene.size();
+        assert!(off < 0.05, "{stall_after:?}: {off}");
+    }
+}
+
+#[test]
 fn a_guest_that_was_cut_off_comes_again() {
     let model = bar(20, 0.05);
     let (mut pair, mut scene) = start(&model);

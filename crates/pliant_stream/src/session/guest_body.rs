@@ -414,7 +414,7 @@ impl StreamedBody {
         }
         let highest = receiver.history().highest();
         self.stalled = quiet && receiver.tick() >= highest;
-        let most = highest + guesses;
+        let most = highest.saturating_add(guesses);
         let mut stepped = 0;
         while let Some(receiver) = &mut self.receiver
             && let Some(due) = self.playout.due(receiver.tick() + 1)
@@ -485,8 +485,8 @@ impl StreamedBody {
     /// Ticks that may be shown beyond the newest received one. After a pause of the host, there are
     /// none until the schedule knows how long the pause was.
     fn guesses(&self) -> u64 {
-        let most = (self.config.stall_after.as_secs_f64() / self.newmark.h).round() as u64 + 1;
-        if self.waits_for > 0 { 0 } else { most }
+        let most = (self.config.stall_after.as_secs_f64() / self.newmark.h).round() as u64;
+        if self.waits_for > 0 { 0 } else { most.saturating_add(1) }
     }
 
     /// Returns whether no tick is shown within the next step, because the schedule waits for the
@@ -494,7 +494,7 @@ impl StreamedBody {
     fn pauses(&self, now: Duration) -> bool {
         let Some(receiver) = &self.receiver else { return false };
         let soon = now + Duration::from_secs_f64(self.newmark.h);
-        receiver.tick() >= receiver.history().highest() + self.guesses()
+        receiver.tick() >= receiver.history().highest().saturating_add(self.guesses())
             || self.playout.due(receiver.tick() + 1).is_none_or(|due| due > soon)
     }
 
@@ -507,7 +507,7 @@ impl StreamedBody {
         let highest = receiver.history().highest();
         let waits = self.wants_snapshot && receiver.tick() + CATCH_UP < highest;
         let fades = (receiver.is_fading() && self.pauses(now)).then_some(self.fade_at.max(now));
-        if self.stalled || waits || receiver.tick() >= highest + self.guesses() {
+        if self.stalled || waits || receiver.tick() >= highest.saturating_add(self.guesses()) {
             return fades;
         }
         let due = self.playout.due(receiver.tick() + 1).map(|t| t.max(now));
