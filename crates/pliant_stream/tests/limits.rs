@@ -4,15 +4,18 @@
 
 mod support;
 
+use std::time::Duration;
+
 use pliant_modal::GrabConfig;
 use pliant_stream::codec::encoder::Encoder;
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::History;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
-    BodyId, GrabKey, GrabState, Newmark, RecoveryConfig, RigidState, StepSettings, TickState, UserId,
+    BodyId, GrabKey, GrabState, HostSession, Newmark, RecoveryConfig, RigidState, StepSettings, TickState,
+    UserId,
 };
-use support::bar;
+use support::{bar, direct};
 
 const H: f64 = 0.025;
 
@@ -154,4 +157,39 @@ fn a_step_moves_the_surface_alike_in_every_mode() {
     let of = |mode: usize| widths.iter().find(|w| w.0 == mode).unwrap().1.unsigned_abs();
     assert!((16_380..=16_388).contains(&of(0)), "{}", of(0));
     assert!(of(59) < 200, "a faint mode takes few bits: {}", of(59));
+}
+
+/// A body that has rested for a day of ticks moves again when it wakes.
+#[test]
+fn a_body_that_has_rested_for_a_day_wakes_up() {
+    let (mut host, mut guest, mut now) = direct::session("default");
+    let zero = [0.0; 12];
+    let publish = |host: &mut HostSession, now: Duration, tick: u64, moves: f64, resting: bool| {
+        let mut q = zero;
+        q[0] = moves;
+        let (v, a) = (&zero, &zero);
+        let state = TickState { tick, q: &q, v, a, z: &[], pose: None, grabs: &[], resting };
+        host.publish(now, direct::BODY, &state).unwrap();
+    };
+    for tick in 60..80 {
+        now += Duration::from_millis(25);
+        publish(&mut host, now, tick, 0.0, true);
+        direct::exchange(&mut host, &mut guest, now);
+    }
+    assert!(guest.body(direct::BODY).unwrap().is_resting());
+    // A day at 40 ticks a second, of which the app publishes one in 200.
+    let day = 86_400 * 40;
+    for tick in (80..80 + day).step_by(200) {
+        now += Duration::from_secs(5);
+        publish(&mut host, now, tick, 0.0, true);
+        direct::exchange(&mut host, &mut guest, now);
+    }
+    let mut shown = 0.0;
+    for tick in 80 + day..200 + day {
+        now += Duration::from_millis(25);
+        publish(&mut host, now, tick, 0.01 * (0.1 * (tick - day) as f64).sin(), false);
+        direct::exchange(&mut host, &mut guest, now);
+        shown = f64::max(shown, guest.body(direct::BODY).unwrap().visual().unwrap().q[0].abs());
+    }
+    assert!(!guest.is_closed() && shown > 0.005, "the guest shows {shown} of 0.01");
 }
