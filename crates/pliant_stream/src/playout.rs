@@ -118,6 +118,11 @@ impl PlayoutClock {
         Duration::try_from_secs_f64(t.max(0.0)).ok()
     }
 
+    /// The tick that is shown at a time, with its fraction; `None` before the first frame.
+    pub fn tick_at(&self, now: Duration) -> Option<f64> {
+        Some((now.as_secs_f64() - self.offset?) / self.h)
+    }
+
     /// Delay of the shown tick behind its earliest arrival, s.
     pub fn delay(&self) -> f64 {
         let earliest = self.samples.iter().copied().fold(f64::INFINITY, f64::min);
