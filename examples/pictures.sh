@@ -97,6 +97,8 @@ picture many_bodies many_bodies
 picture materials materials
 picture free_bodies free_bodies
 picture falling falling
+picture pile pile
+picture from_blender from_blender
 picture walk walk
 picture touch touch
 picture feel feel
@@ -113,6 +115,22 @@ done
 picture panel hello_body --panel --seconds 1
 picture panel-scale-2 hello_body --panel --seconds 1 --size 2560x1440 --scale 2
 picture panel-session shared_body --panel=session --seconds 25
+
+# The model and what is painted on it, by Blender itself, as a program or as a module of Python.
+if is_wanted blender; then
+    bird="$root/tests/blender/bird.py"
+    if command -v blender >/dev/null; then
+        blender --background --python "$bird" -- "$work/bird.glb" "$work/blender.png"
+    elif python3 -c 'import bpy' 2>/dev/null; then
+        python3 "$bird" "$work/bird.glb" "$work/blender.png"
+    else
+        echo "blender.png stays: there is no Blender (or its module for Python: pip install bpy)" >&2
+    fi >"$work/bird.log"
+    if [ -s "$work/blender.png" ]; then
+        if [ "$(stat -c %s "$work/blender.png")" -gt $most ]; then smaller "$work/blender.png"; fi
+        mv "$work/blender.png" "$out/blender.png"
+    fi
+fi
 
 if is_wanted make_models; then cp "$root/assets/jelly.png" "$out/make_models.png"; fi
 
@@ -146,6 +164,10 @@ if is_wanted join || is_wanted dedicated_server; then
     serve "$work/server.log" "$BIN/dedicated_server" --bind 127.0.0.1:0 --play
     picture dedicated_server join "$invite" --cached --still --name "somebody who looks"
     picture join join "$invite" --cached --name guest
+fi
+if is_wanted shared_pile; then
+    serve "$work/pile.log" "$BIN/shared_pile" --headless --seconds 600 --bind 127.0.0.1:0
+    picture shared_pile shared_pile --join "$invite"
 fi
 if is_wanted peers; then
     serve "$work/peer.log" "$BIN/peers" --headless --seconds 600 --name one

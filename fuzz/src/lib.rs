@@ -19,7 +19,7 @@ use pliant_stream::watch::{BodyDecoder, Catalog, WatchHands, WatchSurface};
 use pliant_stream::wire::{Datagram, GuestMessage, HostMessage, PeerMessage};
 use pliant_stream::{
     BodyId, Channel, GrabState, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
-    PeerId, RecoveryConfig, RigidState, StepSettings, Surroundings, TickState, UserId,
+    PeerId, RecoveryConfig, RigidId, RigidState, StepSettings, Surroundings, TickState, UserId,
 };
 
 /// All targets by name.
@@ -40,6 +40,8 @@ pub const TARGETS: [(&str, fn(&[u8])); 12] = [
 
 const BODY: BodyId = BodyId(1);
 const LOOSE: BodyId = BodyId(2);
+const MOVES: RigidId = RigidId(1);
+const RESTS: RigidId = RigidId(2);
 /// Formats of meshes and scenes, by their endings.
 pub const FORMATS: [&str; 10] = ["obj", "stl", "ply", "gltf", "glb", "msh", "vtk", "mesh", "veg", "ron"];
 
@@ -52,6 +54,7 @@ pub fn datagrams(bytes: &[u8]) {
             // Reading normalizes a rotation to a unit quaternion, so its last bit may differ the
             // second time.
             Datagram::Frame(frame) if frame.pose.is_some() => assert!(again.is_ok()),
+            Datagram::Rigids(_) => assert!(again.is_ok()),
             _ => assert_eq!(again, Ok((sequence, datagram))),
         }
     }
@@ -294,6 +297,9 @@ impl Star {
         let (settings, around) = falls();
         host.add_body(LOOSE, "loose", loose(), settings).expect("sound");
         host.set_surroundings(LOOSE, around).expect("sound");
+        for (rigid, name) in [(MOVES, "moves"), (RESTS, "rests")] {
+            host.add_rigid(rigid, name, RigidState::default()).expect("sound");
+        }
         let now = Duration::ZERO;
         let guest = |k: u64| {
             let recovery = recovery(first.wrapping_add(k as u8));
@@ -324,6 +330,9 @@ impl Star {
         let pose = Some(RigidState { position, ..RigidState::default() });
         let state = TickState { pose, grabs: &[], ..state };
         self.host.publish(self.now, LOOSE, &state).expect("sound");
+        let moves = RigidState { position, ..RigidState::default() };
+        let rigids = [(MOVES, moves), (RESTS, RigidState::default())];
+        self.host.publish_rigids(self.now, tick, &rigids).expect("sound");
         for _ in 0..2 {
             self.exchange(lost);
         }
@@ -375,6 +384,7 @@ impl Star {
             while guest.poll_event().is_some() {}
             let user = guest.user();
             assert!(guest.bodies().all(|view| view.visual().is_none_or(|shown| shown.is_finite())));
+            assert!(guest.rigids().all(|rigid| rigid.shown().is_valid()));
             let Some(view) = guest.body(BODY) else { continue };
             for grab in 0..4 {
                 let reaction = user.and_then(|user| view.hand_reaction(user, grab));

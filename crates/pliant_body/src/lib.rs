@@ -190,7 +190,8 @@ impl Default for PliantBodyPlugin {
 pub struct PliantGizmos;
 
 /// Returns whether a schedule belongs to the fixed loop.
-fn is_fixed(schedule: InternedScheduleLabel) -> bool {
+#[doc(hidden)]
+pub fn is_fixed(schedule: InternedScheduleLabel) -> bool {
     [
         FixedFirst.intern(),
         FixedPreUpdate.intern(),

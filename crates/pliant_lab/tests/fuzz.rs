@@ -60,7 +60,7 @@ fn corpora_are_written() {
     use pliant_stream::wire::{PROTOCOL_VERSION, PeerBodyState, PeerMessage, PeerShapes};
     use pliant_stream::{
         Channel, DisconnectReason, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig, PeerId,
-        StepSettings, Surroundings, TickState,
+        RigidId, RigidState, StepSettings, Surroundings, TickState,
     };
     use support::protocol::direct;
 
@@ -98,6 +98,9 @@ fn corpora_are_written() {
     let obstacles = shapes.map(|shape| FixedObstacle { shape, ..FixedObstacle::GROUND }).to_vec();
     let around = Surroundings { obstacles, ..Surroundings::default() };
     host.set_surroundings(direct::BODY, around).unwrap();
+    for rigid in [1, 2] {
+        host.add_rigid(RigidId(rigid), "crate", RigidState::default()).unwrap();
+    }
     let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
     host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
     guest.connect(Duration::ZERO).unwrap();
@@ -107,7 +110,12 @@ fn corpora_are_written() {
         let state =
             TickState { tick, q: &q, v: &q, a: &q, z: &[], pose: None, grabs: &[], resting: look > 50 };
         host.publish(now, direct::BODY, &state).unwrap();
+        // One moves, one rests, and leaves.
+        let moves = RigidState { position: [0.01 * f64::from(look), 0.0, 0.0], ..RigidState::default() };
+        let rigids = [(RigidId(1), moves), (RigidId(2), RigidState::default())];
+        host.publish_rigids(now, tick, &rigids[..if look < 50 { 2 } else { 1 }]).unwrap();
         match look {
+            50 => host.remove_rigid(RigidId(2)),
             20 => drop(guest.begin_grab(now, direct::BODY, 5, 0.1, [1.0; 3], GrabConfig::default())),
             30 => drop(guest.set_interest(direct::BODY, Some(1))),
             40 => guest.end_grab(0),
@@ -125,6 +133,9 @@ fn corpora_are_written() {
         }
         while let Some(out) = host.poll_output() {
             if out.channel == Channel::Datagram {
+                if kind(&out.bytes) == 8 {
+                    write("datagrams", "host-8", &out.bytes);
+                }
                 guest.on_datagram(now, &out.bytes);
             } else {
                 write("messages", &format!("host-{}", kind(&out.bytes)), &out.bytes);

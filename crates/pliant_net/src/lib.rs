@@ -33,6 +33,7 @@
 //! | [`Grab`](pliant_body::Grab) and [`GrabOf`](pliant_body::GrabOf), on guests and on the host | [`GrabForce`](pliant_body::GrabForce): the reaction, in step with the displayed shape |
 //! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: the users, the quality of their connections, their grabs |
 //! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages, and events for observers |
+//! | [`SharedRigid`] on a crate of the host's game | [`RigidArrived`], [`RigidLeft`] on guests: messages, and events for observers |
 //! | [`Interest`] on a guest's body: how many modes the guest wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`], [`SessionFailed`]: messages, and events for observers |
 //! | [`SessionCommands`]: sessions that begin and end while the app runs, also over the app's own [`Carrier`] | [`SessionState`]: a resource |
 //! | | [`RemoteHands`] on a guest's bodies: where the other users' hands are |
@@ -92,11 +93,11 @@ pub use peer::{NetPeer, PeerConfig, PeerState};
 pub use plugin::{NetError, NetPlugin, NetSystems};
 pub use recording::{RecordingError, SessionRecording};
 pub use remote::{
-    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, SessionClosed, SessionFailed,
-    SessionJoined, SessionLost,
+    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, RigidArrived, RigidLeft,
+    SessionClosed, SessionFailed, SessionJoined, SessionLost,
 };
 pub use session::{SessionCommands, SessionState};
-pub use shared_body::SharedBody;
+pub use shared_body::{RemoteRigid, SharedBody, SharedRigid};
 pub use transport::{
     Access, Carrier, CarrierPort, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions,
     MeshCarrier, Role, Token,

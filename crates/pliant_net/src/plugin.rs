@@ -7,7 +7,7 @@ use bevy::camera::visibility::VisibilitySystems;
 use bevy::diagnostic::Diagnostics;
 use bevy::ecs::schedule::{InternedScheduleLabel, ScheduleLabel};
 use bevy::prelude::*;
-use pliant_body::{PliantDisplaySystems, PliantSystems};
+use pliant_body::{PliantDisplaySystems, PliantSystems, is_fixed};
 use pliant_stream::{DisconnectReason, StreamError};
 use thiserror::Error;
 
@@ -18,7 +18,7 @@ use crate::peer::{self, NetPeer, PeerConfig};
 use crate::recording::{RecordingError, SessionRecording};
 use crate::remote::{self, RemoteBody, RemoteHands};
 use crate::session::{self, Opened, SessionControl, SessionState};
-use crate::shared_body::SharedBody;
+use crate::shared_body::{RemoteRigid, SharedBody, SharedRigid};
 use crate::transport::{Invite, InviteError, TransportError};
 use crate::user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself};
 
@@ -70,7 +70,9 @@ pub struct NetPlugin {
 pub enum NetSystems {
     /// `PreUpdate`: received data is processed, and users, bodies and grabs are added and removed.
     Receive,
-    /// Host, in the bodies' schedule, after [`PliantSystems::Publish`]: the step is sent.
+    /// Host, in the bodies' schedule, after [`PliantSystems::Publish`]: the step is sent. Rigid
+    /// bodies ([`SharedRigid`]) follow in `FixedLast`, if the bodies' schedule is one of the fixed
+    /// loop.
     Send,
     /// Guest and peer, `PostUpdate`, before the surfaces are written: the local hands are sent, and
     /// shapes and forces are displayed.
@@ -147,6 +149,8 @@ impl Plugin for NetPlugin {
             .init_resource::<RateMarks>()
             .register_type::<SessionState>()
             .register_type::<SharedBody>()
+            .register_type::<SharedRigid>()
+            .register_type::<RemoteRigid>()
             .register_type::<Holding>()
             .register_type::<Interest>()
             .register_type::<RemoteBody>()
@@ -178,7 +182,7 @@ impl Plugin for NetPlugin {
                 PostUpdate,
                 (
                     host::finish.run_if(resource_exists::<NetHost>),
-                    (guest::send_hands, guest::show)
+                    (guest::send_hands, guest::show, guest::show_rigids)
                         .chain()
                         .in_set(NetSystems::Show)
                         .before(PliantDisplaySystems::Interpolate)
@@ -195,6 +199,15 @@ impl Plugin for NetPlugin {
                 ),
             )
             .add_systems(Last, measure);
+        // A physics engine moves rigid bodies after the bodies of a tick, and before its end.
+        let last = if is_fixed(self.schedule) { FixedLast.intern() } else { self.schedule };
+        app.add_systems(
+            last,
+            host::publish_rigids
+                .in_set(NetSystems::Send)
+                .after(host::publish)
+                .run_if(resource_exists::<NetHost>),
+        );
     }
 }
 

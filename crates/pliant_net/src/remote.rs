@@ -80,6 +80,30 @@ pub struct BodyLeft {
     pub name: String,
 }
 
+/// A rigid body of the host has come into the session. A message, and an event on the entity that
+/// follows it, for observers.
+#[derive(Message, EntityEvent, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub struct RigidArrived {
+    /// The entity, with [`RemoteRigid`](crate::RemoteRigid) and
+    /// [`SharedRigid`](crate::SharedRigid).
+    pub entity: Entity,
+    /// Name of the rigid body.
+    pub name: String,
+}
+
+/// The host has removed a rigid body from the session. An entity that the plugin spawned for it is
+/// despawned, and one of the app stays where it was last shown. A message, and an event on the
+/// entity for observers.
+#[derive(Message, EntityEvent, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub struct RigidLeft {
+    /// The entity that has followed it.
+    pub entity: Entity,
+    /// Name of the rigid body.
+    pub name: String,
+}
+
 /// The host has refused one of this app's grabs, or has taken it off the body. Despawn the grab, or
 /// change its vertex or radius to try again. A message, and an event on the grab's entity for
 /// observers.
@@ -138,6 +162,8 @@ pub struct SessionFailed {
 pub(crate) fn register(app: &mut App) {
     app.register_type::<BodyArrived>()
         .register_type::<BodyLeft>()
+        .register_type::<RigidArrived>()
+        .register_type::<RigidLeft>()
         .register_type::<GrabRefused>()
         .register_type::<SessionLost>()
         .register_type::<SessionJoined>()
@@ -145,6 +171,8 @@ pub(crate) fn register(app: &mut App) {
         .register_type::<SessionFailed>()
         .add_message::<BodyArrived>()
         .add_message::<BodyLeft>()
+        .add_message::<RigidArrived>()
+        .add_message::<RigidLeft>()
         .add_message::<GrabRefused>()
         .add_message::<SessionLost>()
         .add_message::<SessionJoined>()

@@ -18,8 +18,8 @@ use crate::peer::{self, NetPeer, PeerConfig, PeerState};
 use crate::plugin::NetError;
 use crate::recording::SessionRecording;
 use crate::remote::{
-    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHands, SessionClosed, SessionFailed, SessionJoined,
-    SessionLost,
+    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHands, RigidArrived, RigidLeft, SessionClosed,
+    SessionFailed, SessionJoined, SessionLost,
 };
 use crate::transport::{Carrier, Endpoint, Invite, MeshCarrier, TransportError, quic};
 use crate::user::{UserJoined, UserLeft};
@@ -256,6 +256,8 @@ pub(crate) enum SessionEvent {
     Failed(SessionFailed),
     BodyArrived(BodyArrived),
     BodyLeft(BodyLeft),
+    RigidArrived(RigidArrived),
+    RigidLeft(RigidLeft),
     GrabRefused(GrabRefused),
     UserJoined(UserJoined),
     UserLeft(UserLeft),
@@ -510,6 +512,8 @@ fn publish_events(world: &mut World) {
             SessionEvent::Closed(event) => publish(world, event),
             SessionEvent::BodyArrived(event) => publish(world, event),
             SessionEvent::BodyLeft(event) => publish(world, event),
+            SessionEvent::RigidArrived(event) => publish(world, event),
+            SessionEvent::RigidLeft(event) => publish(world, event),
             SessionEvent::GrabRefused(event) => publish(world, event),
             SessionEvent::UserJoined(event) => publish(world, event),
             SessionEvent::UserLeft(event) => publish(world, event),

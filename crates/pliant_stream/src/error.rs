@@ -1,6 +1,6 @@
 //! Errors of this crate.
 
-use crate::{BodyId, PeerId};
+use crate::{BodyId, PeerId, RigidId};
 
 /// Says why a call was refused or bytes could not be decoded.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -57,6 +57,9 @@ pub enum StreamError {
     /// The session does not stream this body.
     #[error("body {0} is not part of this session")]
     UnknownBody(BodyId),
+    /// The session does not have this rigid body.
+    #[error("rigid body {0} is not part of this session")]
+    UnknownRigid(RigidId),
     /// The session does not know this peer.
     #[error("peer {0} is not part of this session")]
     UnknownPeer(PeerId),

@@ -106,9 +106,10 @@ pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};
 pub use session::{
     Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
     HostSessionConfig, LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand, StreamedBody,
+    StreamedRigid,
 };
 pub use state::{
     BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_IMPULSE_SPEED, MAX_MODES, PeerId, Placement,
-    RigidState, Role, State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo, next_free,
+    RigidId, RigidState, Role, State, TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo, next_free,
 };
 pub use surroundings::Surroundings;

@@ -163,6 +163,10 @@ impl Placement {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct BodyId(pub u16);
 
+/// Identifies a rigid body of the session. The host assigns the numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub struct RigidId(pub u16);
+
 /// Identifies a grab within the session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct GrabKey {
@@ -178,13 +182,19 @@ impl fmt::Display for PeerId {
     }
 }
 
+impl fmt::Display for RigidId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.0)
+    }
+}
+
 impl fmt::Display for BodyId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.0)
     }
 }
 
-/// The rigid frame of a free body: pose and twist, in world axes.
+/// A rigid body, or the rigid frame of a free body: pose and twist, in world axes.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct RigidState {
     /// Origin of the body's frame, m.

@@ -9,8 +9,8 @@ use pliant_stream::emulator::LinkConfig;
 use pliant_stream::wire::GuestMessage;
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GrabKey, GrabState, GuestEvent, GuestSession, GuestSessionConfig,
-    HandPlayout, HostEvent, HostSession, HostSessionConfig, Role, StepSettings, StreamError, TickState,
-    UserId,
+    HandPlayout, HostEvent, HostSession, HostSessionConfig, RigidId, RigidState, Role, StepSettings,
+    StreamError, TickState, UserId,
 };
 
 use super::attack::Attacker;
@@ -24,6 +24,9 @@ use super::{
 use crate::pair::{Pair, PathConfig, Stalled, World};
 
 const BODY: BodyId = BodyId(1);
+/// A rigid body of the host's app, and how far guests may show it from where it was, m.
+const CRATE: RigidId = RigidId(1);
+const CRATE_AGREES: f64 = 0.02;
 /// A host plays hands back two ticks late, and leads them by no more than this in a tick, m.
 const PLAYOUT: (usize, f64) = (2, 20.0 / 40.0);
 /// How long a hand has held when the reaction displayed to it is compared with the truth.
@@ -143,6 +146,8 @@ impl World for Apps {
         if self.truth.len() > KEPT {
             self.truth.pop_front();
         }
+        let moved = host.publish_rigids(now, tick, &[(CRATE, crate_at(tick as f64))]);
+        self.ensure(moved.is_ok(), || format!("a rigid body is not published: {moved:?}"));
         self.ensure(finite, || "the host's body is not finite".to_owned());
         self.ensure(published.is_ok(), || format!("a tick is not published: {published:?}"));
         let mut names: Vec<&str> = host.users().map(|(_, _, name)| name).collect();
@@ -276,7 +281,17 @@ fn host_session(model: &Arc<ModalModel>) -> Result<HostSession, String> {
     let config = HostSessionConfig { idle_timeout: IDLE, open: false, ..HostSessionConfig::default() };
     let mut host = HostSession::new(config).map_err(|e| e.to_string())?;
     host.add_body(BODY, "bar", model.clone(), StepSettings::default()).map_err(|e| e.to_string())?;
+    host.add_rigid(CRATE, "crate", crate_at(0.0)).map_err(|e| e.to_string())?;
     Ok(host)
+}
+
+/// The rigid body swings for five seconds, and rests for five.
+fn crate_at(tick: f64) -> RigidState {
+    let (phase, period) = (tick.rem_euclid(400.0), 100.0);
+    let (sine, cosine) = (phase.min(200.0) / period * std::f64::consts::TAU).sin_cos();
+    // At 40 ticks a second.
+    let speed = if phase < 200.0 { 0.5 * std::f64::consts::TAU / (period / 40.0) * cosine } else { 0.0 };
+    RigidState { position: [0.5 * sine, 0.0, 0.0], linear: [speed, 0.0, 0.0], ..RigidState::default() }
 }
 
 fn body(model: &Arc<ModalModel>) -> Result<Body, String> {
@@ -562,6 +577,12 @@ impl Star {
             self.apps.ensure(near, || format!("{name} shows tick {shown} of {tick}"));
             self.apps.ensure(held, || format!("{name} holds nothing, of {hands} hands"));
             self.apps.ensure(off <= AGREES, || format!("{name} is off by {:.2} %", 100.0 * off));
+            let rigid = session.rigid(CRATE).map(|rigid| (rigid.tick(), rigid.shown().position[0]));
+            let (at, shown) = rigid.unwrap_or((f64::NAN, f64::NAN));
+            let near = (-(AHEAD as f64)..40.0).contains(&(tick as f64 - at));
+            let off = (shown - crate_at(at).position[0]).abs();
+            let agrees = near && off <= CRATE_AGREES;
+            self.apps.ensure(agrees, || format!("{name} shows a crate at {shown} m for tick {at} of {tick}"));
         }
     }
 }

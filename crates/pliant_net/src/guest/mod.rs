@@ -4,6 +4,7 @@
 mod bodies;
 mod hands;
 mod interest;
+mod rigids;
 mod session;
 mod show;
 mod source;
@@ -19,8 +20,8 @@ use bevy::tasks::Task;
 use pliant_body::BodyRefused;
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, DisconnectReason, GuestSession, LinkStats, PeerId, RecoveryConfig, State, StreamedBody, Tick,
-    UserId,
+    BodyId, DisconnectReason, GuestSession, LinkStats, PeerId, RecoveryConfig, RigidId, State, StreamedBody,
+    Tick, UserId,
 };
 
 use crate::metrics::{Ledger, NetStats};
@@ -29,11 +30,13 @@ use crate::roster::Roster;
 use crate::transport::{Carrier, Emulation, Endpoint, JoinOptions, Role};
 use bodies::FollowedBody;
 use hands::SentGrab;
+use rigids::FollowedRigid;
 use source::Source;
 
 pub(crate) use hands::send_hands;
 pub use interest::{CameraInterest, Interest};
 pub(crate) use interest::{look, send_interest};
+pub(crate) use rigids::show_rigids;
 pub(crate) use session::receive;
 pub(crate) use show::show;
 
@@ -132,6 +135,9 @@ pub struct NetGuest {
     role: Role,
     session: Option<GuestSession>,
     bodies: BTreeMap<BodyId, FollowedBody>,
+    rigids: BTreeMap<RigidId, FollowedRigid>,
+    /// Those of a lost session, which the next session may have again.
+    orphan_rigids: Vec<FollowedRigid>,
     /// Bodies of a lost session, which the next session may have again.
     orphans: Vec<FollowedBody>,
     /// Bodies that the host has removed, on entities of the app, for when the app leaves.
@@ -173,6 +179,8 @@ impl NetGuest {
             role: Role::Hold,
             session: None,
             bodies: BTreeMap::new(),
+            rigids: BTreeMap::new(),
+            orphan_rigids: Vec::new(),
             orphans: Vec::new(),
             removed: Vec::new(),
             users: Roster::default(),

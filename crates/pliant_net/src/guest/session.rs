@@ -174,6 +174,7 @@ impl NetGuest {
         if inside && self.rejoin.orphans_until.is_some_and(|until| now >= until) {
             self.rejoin.orphans_until = None;
             self.forget_orphans(world);
+            self.forget_orphan_rigids(world);
         }
     }
 
@@ -181,6 +182,7 @@ impl NetGuest {
     fn leave_session(&mut self, world: &mut World) {
         self.grabs.clear();
         self.orphan_bodies(world);
+        self.orphan_rigids(world);
         self.users.clear(world);
     }
 
@@ -210,6 +212,8 @@ impl NetGuest {
         }
         self.source.end();
         self.give_back_bodies(world);
+        self.orphan_rigids(world);
+        self.forget_orphan_rigids(world);
     }
 
     fn take_events(&mut self, world: &mut World) {
@@ -221,6 +225,8 @@ impl NetGuest {
                 GuestEvent::BodyChanged { body } => self.body_changed(world, body),
                 GuestEvent::BodyPlaced { body, placement } => self.place(world, body, placement),
                 GuestEvent::BodyGone { body } => self.body_gone(world, body),
+                GuestEvent::RigidArrived { rigid, name } => self.rigid_arrived(world, rigid, name),
+                GuestEvent::RigidGone { rigid } => self.rigid_gone(world, rigid),
                 GuestEvent::Stalled { body } => {
                     debug!("body {body} stands still: nothing comes from the host")
                 }

@@ -4,6 +4,7 @@
 mod guests;
 mod hands;
 mod publish;
+mod rigids;
 mod surroundings;
 
 use std::collections::BTreeMap;
@@ -32,6 +33,7 @@ pub(crate) use guests::receive;
 pub use hands::Holding;
 pub(crate) use hands::move_hands;
 pub(crate) use publish::{finish, publish};
+pub(crate) use rigids::publish_rigids;
 
 /// How to host a session.
 #[derive(Debug)]
@@ -85,6 +87,7 @@ pub struct NetHost {
     smoothing: f64,
     reach: f64,
     bodies: BTreeMap<Entity, HostedBody>,
+    rigids: rigids::HostedRigids,
     next_body: u16,
     /// Open connections, with or without a completed join.
     guests: BTreeMap<PeerId, Guest>,
@@ -134,6 +137,7 @@ impl NetHost {
             smoothing: config.smoothing.max(0.0),
             reach,
             bodies: BTreeMap::new(),
+            rigids: rigids::HostedRigids::default(),
             next_body: 1,
             guests: BTreeMap::new(),
             known: KnownUsers::restored(&config.known),

@@ -11,12 +11,13 @@ use super::download::Download;
 use super::guest_body::StreamedBody;
 use super::guest_config::{GuestEvent, GuestSessionConfig};
 use super::guest_hands::LocalGrab;
+use super::guest_rigids::{GuestRigids, StreamedRigid};
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
 use crate::link::{Budget, Events, Link, STOOD_STILL, micros};
 use crate::newmark::Newmark;
-use crate::state::{BodyId, PeerId, UserId, UserInfo, UserLinkInfo};
+use crate::state::{BodyId, PeerId, RigidId, UserId, UserInfo, UserLinkInfo};
 use crate::wire::{
     Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, PROTOCOL_VERSION,
 };
@@ -50,6 +51,7 @@ pub struct GuestSession {
     /// Hashes of all models that the host has named, at most 16,384 (512 KiB).
     pub(super) announced: BTreeSet<[u8; 32]>,
     pub(super) bodies: BTreeMap<BodyId, StreamedBody>,
+    rigids: GuestRigids,
     stalled: BTreeSet<BodyId>,
     users: BTreeMap<UserId, UserInfo>,
     links: BTreeMap<UserId, UserLinkInfo>,
@@ -79,7 +81,6 @@ impl GuestSession {
             return fail("datagram size", max_datagram.to_string(), "at least 256 bytes");
         }
         Ok(Self {
-            config,
             link: Link::new(PeerId::HOST, Duration::ZERO, max_datagram),
             standing: GuestStanding::New,
             newmark: Newmark::average(1.0 / 40.0),
@@ -89,6 +90,7 @@ impl GuestSession {
             model_bytes: 0,
             announced: BTreeSet::new(),
             bodies: BTreeMap::new(),
+            rigids: GuestRigids::new(1.0 / 40.0, config.recovery.playout),
             stalled: BTreeSet::new(),
             users: BTreeMap::new(),
             links: BTreeMap::new(),
@@ -101,6 +103,7 @@ impl GuestSession {
             clock: ClockEstimate::default(),
             next_ping: Duration::ZERO,
             pings: 0,
+            config,
         })
     }
 
@@ -183,6 +186,16 @@ impl GuestSession {
         self.bodies.values()
     }
 
+    /// Returns a rigid body of the session.
+    pub fn rigid(&self, rigid: RigidId) -> Option<&StreamedRigid> {
+        self.rigids.get(rigid)
+    }
+
+    /// Iterates over all rigid bodies.
+    pub fn rigids(&self) -> impl Iterator<Item = &StreamedRigid> {
+        self.rigids.iter()
+    }
+
     /// Iterates over the other users in the session, with the user at the host if there is one.
     pub fn users(&self) -> impl Iterator<Item = &UserInfo> {
         self.users.values()
@@ -238,6 +251,7 @@ impl GuestSession {
                 view.take_frame(now, frame);
                 self.ask(now, body);
             }
+            Datagram::Rigids(poses) => self.rigids.take(now, &poses),
             Datagram::Pong(clock) => {
                 self.link.take_report(clock.report);
                 // The request has come at t2, or later if the host stood still: then nobody knows.
@@ -268,6 +282,7 @@ impl GuestSession {
                     return self.close(DisconnectReason::VersionMismatch);
                 }
                 self.newmark = Newmark { h: step_ns as f64 * 1e-9, beta, gamma };
+                self.rigids = GuestRigids::new(self.newmark.h, self.config.recovery.playout);
                 self.standing = GuestStanding::In(UserId(user));
                 self.users = users.into_iter().map(|info| (info.user, info)).collect();
                 self.next_ping = now;
@@ -340,6 +355,20 @@ impl GuestSession {
                 view.placement = Some(placement);
                 self.event(GuestEvent::BodyPlaced { body, placement });
             }
+            HostMessage::RigidAdded { rigid, name, tick, state } => {
+                let rigid = RigidId(rigid);
+                if !self.rigids.add(rigid, &name, tick, state) {
+                    return self.break_off(DisconnectReason::Protocol);
+                }
+                self.event(GuestEvent::RigidArrived { rigid, name });
+            }
+            HostMessage::RigidsRest { tick, rigids } => self.rigids.rest(tick, &rigids),
+            HostMessage::RigidRemoved { rigid } => {
+                let rigid = RigidId(rigid);
+                if self.rigids.remove(rigid) {
+                    self.event(GuestEvent::RigidGone { rigid });
+                }
+            }
             HostMessage::Links(links) => {
                 for link in links {
                     if self.users.contains_key(&link.user) {
@@ -405,6 +434,7 @@ impl GuestSession {
             }
             self.ask(now, id);
         }
+        self.rigids.advance(now);
         self.send_targets(now);
         if now >= self.next_ping {
             self.pings += 1;

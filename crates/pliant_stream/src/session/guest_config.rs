@@ -7,7 +7,7 @@ use pliant_modal::ModalModel;
 
 use super::DisconnectReason;
 use crate::recovery::RecoveryConfig;
-use crate::state::{BodyId, Placement, UserId, UserInfo};
+use crate::state::{BodyId, Placement, RigidId, UserId, UserInfo};
 
 /// Settings of a guest.
 #[derive(Debug, Clone, PartialEq)]
@@ -109,6 +109,19 @@ pub enum GuestEvent {
     BodyGone {
         /// The body.
         body: BodyId,
+    },
+    /// A rigid body has come into the session
+    /// ([`GuestSession::rigid`](super::GuestSession::rigid)).
+    RigidArrived {
+        /// The rigid body.
+        rigid: RigidId,
+        /// Its name.
+        name: String,
+    },
+    /// A rigid body has left the session.
+    RigidGone {
+        /// The rigid body.
+        rigid: RigidId,
     },
     /// The state of a body was replaced by a snapshot.
     Resynced {

@@ -11,6 +11,7 @@ use pliant_modal::{ModalModel, StepSettings};
 use super::budgets::{GuestBudgets, SharedBudgets};
 use super::host_config::{HostEvent, HostSessionConfig};
 use super::host_peer::{GuestPeer, Standing};
+use super::host_rigids::HostRigids;
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::codec::encoder::Encoder;
@@ -99,6 +100,7 @@ pub struct HostSession {
     host_user: Option<UserInfo>,
     pub(super) peers: BTreeMap<PeerId, GuestPeer>,
     pub(super) bodies: BTreeMap<BodyId, HostBody>,
+    pub(super) rigids: HostRigids,
     pub(super) out: VecDeque<Output>,
     events: Events<HostEvent>,
     next_user: u16,
@@ -135,6 +137,7 @@ impl HostSession {
             host_user: None,
             peers: BTreeMap::new(),
             bodies: BTreeMap::new(),
+            rigids: HostRigids::default(),
             out: VecDeque::new(),
             events: Events::default(),
             next_user: 1,
@@ -182,7 +185,7 @@ impl HostSession {
         if self.peers.len() >= self.config.max_guests {
             return Err(StreamError::Full { what: "guests", limit: self.config.max_guests });
         }
-        self.peers.insert(peer, GuestPeer::new(peer, now, max_datagram, self.config.model_rate));
+        self.peers.insert(peer, GuestPeer::new(peer, now, max_datagram, &self.config));
         Ok(())
     }
 
@@ -405,6 +408,7 @@ impl HostSession {
         for body in bodies {
             self.announce(peer, body);
         }
+        self.announce_rigids(peer);
     }
 
     /// Sends the quality of the host's links to all guests in the session.

@@ -5,10 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::budgets::{GuestBudgets, SharedBudgets};
+use super::host_config::HostSessionConfig;
+use super::host_rigids::rigid_budget;
 use super::regulator::Regulator;
 use super::{DisconnectReason, Output};
-use crate::link::{Link, micros};
-use crate::state::{BodyId, PeerId, Role, Tick, UserId, UserInfo};
+use crate::link::{Budget, Link, micros};
+use crate::state::{BodyId, PeerId, RigidId, Role, Tick, UserId, UserInfo};
 use crate::wire::{Clock, Datagram, HostMessage, StreamSubscription};
 
 /// Largest number of grabs of one guest.
@@ -64,6 +66,10 @@ pub(crate) struct GuestPeer {
     pub(crate) interest: BTreeMap<BodyId, u16>,
     pub(crate) grabs: BTreeMap<u16, AnnouncedGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
+    /// The last tick of each rigid body that was sent in a datagram.
+    pub(crate) rigids: BTreeMap<RigidId, Tick>,
+    /// Bytes of datagrams of rigid bodies.
+    pub(crate) rigid_bytes: Budget,
     /// The last clock request: the guest's stamp, and the time at which it came at the earliest.
     ping: Option<(u64, Duration)>,
     /// Bytes of messages that the transport has accepted and not sent, as last reported.
@@ -76,7 +82,7 @@ pub(crate) struct GuestPeer {
 }
 
 impl GuestPeer {
-    pub(crate) fn new(id: PeerId, now: Duration, max_datagram: usize, model_rate: f64) -> Self {
+    pub(crate) fn new(id: PeerId, now: Duration, max_datagram: usize, config: &HostSessionConfig) -> Self {
         Self {
             id,
             link: Link::new(id, now, max_datagram),
@@ -92,9 +98,11 @@ impl GuestPeer {
             interest: BTreeMap::new(),
             grabs: BTreeMap::new(),
             resends: VecDeque::new(),
+            rigids: BTreeMap::new(),
+            rigid_bytes: rigid_budget(config.guest_rate),
             ping: None,
             unsent: 0,
-            budgets: GuestBudgets::new(model_rate),
+            budgets: GuestBudgets::new(config.model_rate),
             share: SharedBudgets::of_one(now),
             regulator: Regulator::default(),
         }

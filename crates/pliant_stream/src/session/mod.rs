@@ -9,7 +9,7 @@
 //! | --- | --- | --- |
 //! | connection opens | [`HostSession::connect`] | [`GuestSession::new`], [`GuestSession::connect`] |
 //! | datagram, reliable message arrives | `on_datagram`, `on_message` | the same |
-//! | after a step of the simulation | [`HostSession::publish`] for each body | |
+//! | after a step of the simulation | [`HostSession::publish`] for each body, [`HostSession::publish_rigids`] | |
 //! | once a frame, and at `next_wakeup` | [`HostSession::update`] | [`GuestSession::update`] |
 //! | then, until `None` | `poll_output`, `poll_event` | the same |
 //!
@@ -24,10 +24,12 @@ mod guest;
 mod guest_body;
 mod guest_config;
 mod guest_hands;
+mod guest_rigids;
 mod host;
 mod host_bodies;
 mod host_config;
 mod host_peer;
+mod host_rigids;
 mod publish;
 mod regulator;
 mod upload;
@@ -38,6 +40,7 @@ pub use disconnect_reason::DisconnectReason;
 pub use guest::GuestSession;
 pub use guest_body::StreamedBody;
 pub use guest_config::{GuestEvent, GuestSessionConfig};
+pub use guest_rigids::StreamedRigid;
 pub use host::HostSession;
 pub use host_config::{HostEvent, HostSessionConfig};
 

@@ -1,6 +1,6 @@
 //! The kinds of datagram between host and guest, and between peers.
 
-use super::{Inputs, Reader, TickFrame, Writer};
+use super::{Inputs, Reader, RigidPoses, TickFrame, Writer};
 use crate::StreamError;
 use crate::state::{BodyId, Tick};
 
@@ -11,6 +11,7 @@ const PING: u8 = 4;
 const PONG: u8 = 5;
 const INPUTS: u8 = 6;
 const INPUT_REQUEST: u8 = 7;
+const RIGIDS: u8 = 8;
 
 /// Largest number of runs in one NACK or input request.
 pub(crate) const MAX_NACK_RUNS: usize = 32;
@@ -98,6 +99,8 @@ pub enum Datagram {
     Inputs(Inputs),
     /// Peer to peer: runs of the receiver's inputs that the sender lacks, at most 32.
     InputRequest(Vec<NackRun>),
+    /// Host to guest: rigid bodies that move.
+    Rigids(RigidPoses),
 }
 
 impl Datagram {
@@ -161,6 +164,10 @@ impl Datagram {
                 w.raw(&Self::header(INPUT_REQUEST, sequence));
                 encode_runs(runs, &mut w);
             }
+            Self::Rigids(rigids) => {
+                w.raw(&Self::header(RIGIDS, sequence));
+                rigids.encode(&mut w);
+            }
         }
         w.into_bytes()
     }
@@ -204,11 +211,12 @@ impl Datagram {
             }
             INPUTS => Self::Inputs(Inputs::decode(&mut r)?),
             INPUT_REQUEST => Self::InputRequest(decode_runs(&mut r)?),
+            RIGIDS => Self::Rigids(RigidPoses::decode(&mut r)?),
             other => {
                 return Err(StreamError::Invalid {
                     what: "datagram kind",
                     found: other.to_string(),
-                    expected: "1..=7",
+                    expected: "1..=8",
                 });
             }
         };

@@ -16,6 +16,8 @@ pub(crate) const MAX_NAME: usize = 64;
 pub(crate) const MAX_CACHED: usize = 256;
 /// Largest number of bodies in a session.
 pub(crate) const MAX_BODIES: usize = 1024;
+/// Largest number of rigid bodies in a session.
+pub(crate) const MAX_RIGIDS: usize = 1024;
 
 /// Payload of the frames of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -215,6 +217,30 @@ pub enum HostMessage {
         /// The reason.
         reason: DisconnectReason,
     },
+    /// A rigid body joins the session. All that rest are known from this and from
+    /// [`HostMessage::RigidsRest`]; of those that move, datagrams tell.
+    RigidAdded {
+        /// Number of the rigid body.
+        rigid: u16,
+        /// Name, at most 64 bytes.
+        name: String,
+        /// The tick after which the state holds.
+        tick: u64,
+        /// Where it is, and how it moves.
+        state: RigidState,
+    },
+    /// Rigid bodies that have come to rest, and where.
+    RigidsRest {
+        /// The tick after which they rest.
+        tick: u64,
+        /// Numbers and states, at most 1,024.
+        rigids: Vec<(u16, RigidState)>,
+    },
+    /// A rigid body leaves the session.
+    RigidRemoved {
+        /// Number of the rigid body.
+        rigid: u16,
+    },
 }
 
 pub(super) fn decode<'a, M: Deserialize<'a>>(what: &'static str, bytes: &'a [u8]) -> Result<M, StreamError> {
@@ -358,7 +384,19 @@ impl HostMessage {
                 check("placement", placement.is_valid(), format!("{placement:?}"), expected)?;
             }
             Self::UserJoined(user) => check_user(user)?,
+            Self::RigidAdded { name, tick, state, .. } => {
+                check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
+                check("rigid tick", *tick < TICK_LIMIT, tick, "below 2^48")?;
+                check("rigid body", state.is_valid(), format!("{state:?}"), "a pose in range")?;
+            }
+            Self::RigidsRest { tick, rigids } => {
+                check("rigid tick", *tick < TICK_LIMIT, tick, "below 2^48")?;
+                check("rigid bodies", rigids.len() <= MAX_RIGIDS, rigids.len(), "at most 1024")?;
+                let valid = rigids.iter().all(|(_, state)| state.is_valid());
+                check("rigid bodies", valid, "a number out of range", "poses in range")?;
+            }
             Self::BodyRemoved { .. }
+            | Self::RigidRemoved { .. }
             | Self::ModelChunk { .. }
             | Self::UserLeft { .. }
             | Self::Links(_)

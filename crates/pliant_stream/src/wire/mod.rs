@@ -13,6 +13,7 @@ mod hold;
 mod inputs;
 mod message;
 mod peer_message;
+mod rigids;
 mod slice;
 
 pub(crate) use bytes::{Reader, WIDE_LIMIT, Writer, round24};
@@ -23,10 +24,12 @@ pub use frame::{AccelerationCoding, Accelerations, FrameGrab, Repeat, RepeatGrab
 pub use inputs::{HeldAt, ImpulseAt, InputTick, Inputs, StateCheck};
 pub(crate) use inputs::{MAX_HELD, MAX_IMPULSES, MAX_TICKS};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
-pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, check_hold};
+pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_RIGIDS, check_hold};
 pub(crate) use peer_message::{MAX_ADDRESS, MAX_PEERS, MAX_SETS};
 pub use peer_message::{PeerBodyState, PeerFrame, PeerHandState, PeerMessage, PeerShapes};
+pub use rigids::RigidPoses;
+pub(crate) use rigids::{ENTRY as RIGID_ENTRY, HEADER as RIGID_HEADER, MAX_ENTRIES as MAX_RIGID_ENTRIES};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.
-pub const PROTOCOL_VERSION: u16 = 8;
+pub const PROTOCOL_VERSION: u16 = 9;

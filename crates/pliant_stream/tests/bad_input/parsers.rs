@@ -53,7 +53,14 @@ fn parse_all(bytes: &[u8]) -> u32 {
     if let Ok((sequence, d)) = Datagram::decode(bytes) {
         read += 1;
         let again = Datagram::decode(&d.encode(sequence)).expect("what was read can be written");
-        if !matches!(&d, Datagram::Frame(f) if f.pose.is_some()) {
+        if let (Datagram::Rigids(one), (other, Datagram::Rigids(two))) = (&d, &again) {
+            assert_eq!((one.tick, one.poses.len(), sequence), (two.tick, two.poses.len(), *other));
+            for ((id, a), (again, b)) in one.poses.iter().zip(&two.poses) {
+                assert_eq!((id, a.position, a.linear, a.angular), (again, b.position, b.linear, b.angular));
+                let dot: f64 = (0..4).map(|k| a.rotation[k] * b.rotation[k]).sum();
+                assert!(dot.abs() > 1.0 - 1e-11, "{:?} and {:?}", a.rotation, b.rotation);
+            }
+        } else if !matches!(&d, Datagram::Frame(f) if f.pose.is_some()) {
             // (Reading normalizes a rotation to a unit quaternion, so its last bit may differ the
             // second time.)
             assert_eq!(again, (sequence, d));

@@ -7,10 +7,10 @@ use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
     HostMessage, ImpulseAt, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerHandState,
-    PeerMessage, PeerShapes, ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes,
-    StateCheck, TargetEntry, Targets, TickFrame,
+    PeerMessage, PeerShapes, ReceiverReport, Repeat, RepeatGrab, RigidPoses, Slice, SliceEntry,
+    SnapshotBytes, StateCheck, TargetEntry, Targets, TickFrame,
 };
-use pliant_stream::{Newmark, RigidState, StepSettings, Surroundings};
+use pliant_stream::{Newmark, RigidId, RigidState, StepSettings, Surroundings};
 
 use super::support::bar;
 use super::support::direct::{BODY, grab};
@@ -160,6 +160,12 @@ pub(super) fn real_inputs() -> Vec<Vec<u8>> {
     let check = Some(StateCheck { body: BODY, tick: 8, value: 0.5 });
     all.push(Datagram::Inputs(Inputs { now: 9, ahead: Some(0.5), ticks, check }).encode(1));
     all.push(Datagram::InputRequest(vec![NackRun { first: 5, count: 3 }]).encode(2));
+    let state = RigidState { position: [1.0, 2.0, 3.0], linear: [0.5; 3], ..RigidState::default() };
+    let poses = vec![(RigidId(1), state), (RigidId(7), RigidState::default())];
+    all.push(Datagram::Rigids(RigidPoses { tick: 9, poses }).encode(3));
+    all.push(HostMessage::RigidAdded { rigid: 1, name: "a crate".into(), tick: 8, state }.encode());
+    all.push(HostMessage::RigidsRest { tick: 9, rigids: vec![(1, state), (7, state)] }.encode());
+    all.push(HostMessage::RigidRemoved { rigid: 1 }.encode());
     let frame =
         PeerFrame { center: [0.0; 3], orientation: [0.0, 0.0, 0.0, 1.0], velocity: [0.1; 3], spin: [0.0; 3] };
     let body = PeerBodyState {
