@@ -109,7 +109,7 @@ fn moved(from: &RigidState, to: RigidState, time: f64) -> (RigidState, RigidStat
 /// goes on for half a tick. After a blow, or where something was put elsewhere, the smaller of both
 /// means is the one that misleads less.
 fn velocities(mean: DVec3, before: DVec3, time: f64) -> [DVec3; 2] {
-    if !(mean.length() < JUMP) {
+    if mean.is_nan() || mean.length() > JUMP {
         return [DVec3::ZERO; 2];
     }
     let change = mean - before;
