@@ -128,7 +128,7 @@ fn write(mut bake: ResMut<Bake>, bodies: Query<&BodyState>, mut readout: ResMut<
         let coordinates: usize = bodies.iter().map(|state| state.model().mode_count()).sum();
         let mass: f64 = bodies.iter().map(|state| state.model().mass()).sum();
         bake.told = Some(format!(
-            "baked in   {:.1} s\nbodies     {}\nmass       {mass:.2} kg\ncoordinates {coordinates}",
+            "baked in    {:.1} s\nbodies      {}\nmass        {mass:.2} kg\ncoordinates {coordinates}",
             bake.begun.elapsed().as_secs_f64(),
             bodies.iter().len(),
         ));

@@ -117,7 +117,9 @@ impl PluginGroup for Stage {
                 .set(LogPlugin {
                     level: Level::WARN,
                     // These crates would warn that there is no renderer, which is intended.
-                    filter: format!("{DEFAULT_FILTER},bevy_render=off,bevy_gizmos_render=off"),
+                    filter: format!(
+                        "{DEFAULT_FILTER},bevy_render=off,bevy_gizmos_render=off,bevy_gltf=error"
+                    ),
                     ..default()
                 })
                 .set(WindowPlugin {

@@ -415,12 +415,12 @@ impl Body {
 
     /// Leads the hands to their targets.
     pub(crate) fn begin_step(&mut self) {
-        let fade = (-self.config.step / SLIP_TIME).exp();
+        let fade = || (-self.config.step / SLIP_TIME).exp();
         for (hand, grab) in self.hands.iter_mut().zip(&mut self.grabs) {
             // A hand has no velocity in the first step of its grab.
             let way = grab.last_target.map_or_else(Vector3::zeros, |last| grab.target - last);
             // Below a nanometer nothing is left, so that a body at rest may sleep.
-            let slip = if grab.slip.norm() > 1e-9 { fade * grab.slip } else { Vector3::zeros() };
+            let slip = if grab.slip.norm() > 1e-9 { fade() * grab.slip } else { Vector3::zeros() };
             let way = way + slip - grab.slip;
             grab.slip = slip;
             let (target, config) = (grab.target + grab.slip, grab.config);

@@ -254,11 +254,16 @@ impl Contacts {
     /// Forgets the forces and anchors of the last step. A body whose state was set from elsewhere
     /// must forget them.
     pub fn forget(&mut self) {
+        self.end();
+        self.theta = 0.5;
+        self.lost = 0.0;
+    }
+
+    /// Ends all contacts, for a step in which nothing is touched.
+    pub(crate) fn end(&mut self) {
         self.memory.clear();
         self.list.clear();
         self.report = ContactReport::default();
-        self.theta = 0.5;
-        self.lost = 0.0;
     }
 
     /// Writes what the contacts with obstacles have left for the next step. Contacts whose numbers
