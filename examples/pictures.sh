@@ -59,7 +59,9 @@ from PIL import Image
 file, most = sys.argv[1], int(sys.argv[2])
 picture = Image.open(file).convert("RGB")
 for colors in 256, 192, 128:
-    picture.quantize(colors, dither=Image.Dither.NONE).save(file, optimize=True)
+    # Small parts of a picture get colors, too.
+    method = Image.Quantize.MAXCOVERAGE
+    picture.quantize(colors, method, dither=Image.Dither.NONE).save(file, optimize=True)
     if os.path.getsize(file) <= most:
         break
 PYTHON
@@ -167,7 +169,8 @@ if is_wanted join || is_wanted dedicated_server; then
 fi
 if is_wanted shared_pile; then
     serve "$work/pile.log" "$BIN/shared_pile" --headless --seconds 600 --bind 127.0.0.1:0
-    picture shared_pile shared_pile --join "$invite"
+    # A software renderer keeps up with the session at this size.
+    picture shared_pile shared_pile --join "$invite" --size 896x504
 fi
 if is_wanted peers; then
     serve "$work/peer.log" "$BIN/peers" --headless --seconds 600 --name one

@@ -52,7 +52,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .real_time()
         .key("left mouse: pull a jack")
         .look(Look { middle: Vec3::new(0.0, 0.3, 0.0), distance: 3.4, yaw: 0.4, pitch: 0.35 })
-        .picture_at(5.0);
+        .picture_at(12.0);
     session::end_on_terminate();
     let mut app = App::new();
     app.add_plugins(stage).insert_resource(BodyGravity::EARTH).add_systems(Update, write);
