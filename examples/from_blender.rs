@@ -27,7 +27,7 @@ use pliant::{
     body::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeFailed, BakeNode, BakePlugin},
     prelude::*,
 };
-use stage::{Readout, Stage};
+use stage::{Awaited, Readout, Stage};
 
 /// Makes soft bodies of the nodes of a glTF file that have the custom property `stiffness`.
 #[derive(Parser, Debug)]
@@ -79,7 +79,7 @@ fn main() -> AppExit {
         .insert_resource(bake)
         .add_systems(Startup, |mut commands: Commands, assets: Res<AssetServer>, bake: Res<Bake>| {
             let scene = GltfAssetLabel::Scene(0).from_asset(bake.file.clone());
-            commands.spawn(WorldAssetRoot(assets.load(scene)));
+            commands.spawn((WorldAssetRoot(assets.load(scene)), Awaited));
         })
         .add_systems(Update, (bake_what_says_so, write))
         .add_systems(FixedUpdate, nudge.before(PliantSystems::Input))
@@ -123,7 +123,13 @@ fn nudge(
     }
 }
 
-fn write(mut bake: ResMut<Bake>, bodies: Query<&BodyState>, mut readout: ResMut<Readout>) {
+fn write(
+    mut commands: Commands,
+    mut bake: ResMut<Bake>,
+    bodies: Query<&BodyState>,
+    awaited: Query<Entity, With<Awaited>>,
+    mut readout: ResMut<Readout>,
+) {
     if bake.told.is_none() && !bodies.is_empty() {
         let coordinates: usize = bodies.iter().map(|state| state.model().mode_count()).sum();
         let mass: f64 = bodies.iter().map(|state| state.model().mass()).sum();
@@ -132,6 +138,9 @@ fn write(mut bake: ResMut<Bake>, bodies: Query<&BodyState>, mut readout: ResMut<
             bake.begun.elapsed().as_secs_f64(),
             bodies.iter().len(),
         ));
+    }
+    if bake.told.is_some() {
+        awaited.iter().for_each(|entity| _ = commands.entity(entity).remove::<Awaited>());
     }
     let text = bake.told.clone().unwrap_or_else(|| format!("{} is being baked", bake.file));
     if readout.0 != text {
