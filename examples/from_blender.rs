@@ -17,10 +17,11 @@ use std::{
 };
 
 use bevy::{
+    asset::LoadState,
     gltf::{GltfExtras, GltfPlugin},
     math::DVec3,
     prelude::*,
-    world_serialization::WorldAssetRoot,
+    world_serialization::{WorldAsset, WorldAssetRoot},
 };
 use clap::Parser;
 use pliant::{
@@ -35,9 +36,8 @@ struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// The model, as Blender exports it (.glb or .gltf).
-    #[arg(default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bird.glb"))]
-    model: PathBuf,
+    /// The model, as Blender exports it (.glb or .gltf). Default: the bird in the project's assets.
+    model: Option<PathBuf>,
 
     /// Approximate number of tetrahedra of a body.
     #[arg(long, default_value_t = 5000)]
@@ -47,17 +47,23 @@ struct Options {
 #[derive(Resource)]
 struct Bake {
     file: String,
+    scene: Handle<WorldAsset>,
     tets: usize,
     begun: Instant,
-    told: Option<String>,
+    /// Bodies that are there, and the time until the last one was, s.
+    bodies: (usize, f64),
+    /// Frames since the file was read.
+    frames: u32,
+    wrong: Vec<String>,
 }
 
 fn main() -> AppExit {
     let options = Options::parse();
-    let (folder, file) = (options.model.parent(), options.model.file_name());
+    let model = options.model.unwrap_or_else(|| Path::new(stage::ASSETS).join("bird.glb"));
+    let (folder, file) = (model.parent(), model.file_name());
     let folder = folder.filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let (Ok(folder), Some(file)) = (folder.canonicalize(), file) else {
-        eprintln!("from_blender: there is no {}", options.model.display());
+        eprintln!("from_blender: there is no {}", model.display());
         return AppExit::from_code(2);
     };
     // Bevy's glTF plugin needs the names of the painted attributes, without their underscore.
@@ -69,22 +75,25 @@ fn main() -> AppExit {
     let stage = Stage::with("from_blender", options.stage).real_time().key("left mouse: pull the body");
     let bake = Bake {
         file: file.to_string_lossy().into_owned(),
+        scene: Handle::default(),
         tets: options.tets,
         begun: Instant::now(),
-        told: None,
+        bodies: (0, 0.0),
+        frames: 0,
+        wrong: Vec::new(),
     };
     App::new()
         .add_plugins(stage.build().set(gltf).set(folder))
         .add_plugins((PliantPlugins::default(), BakePlugin::default()))
         .insert_resource(bake)
-        .add_systems(Startup, |mut commands: Commands, assets: Res<AssetServer>, bake: Res<Bake>| {
-            let scene = GltfAssetLabel::Scene(0).from_asset(bake.file.clone());
-            commands.spawn((WorldAssetRoot(assets.load(scene)), Awaited));
+        .add_systems(Startup, |mut commands: Commands, assets: Res<AssetServer>, mut bake: ResMut<Bake>| {
+            bake.scene = assets.load(GltfAssetLabel::Scene(0).from_asset(bake.file.clone()));
+            commands.spawn((WorldAssetRoot(bake.scene.clone()), Awaited));
         })
         .add_systems(Update, (bake_what_says_so, write))
         .add_systems(FixedUpdate, nudge.before(PliantSystems::Input))
         .add_observer(|failed: On<BakeFailed>, mut bake: ResMut<Bake>| {
-            bake.told = Some(format!("no body: {}", failed.error));
+            bake.wrong.push(format!("no body: {}", failed.error));
         })
         .run()
 }
@@ -97,7 +106,7 @@ fn bake_what_says_so(
     for (node, extras) in nodes.iter().filter(|(_, extras)| extras.value.contains("stiffness")) {
         match (BakeNode { tets: bake.tets, ..default() }).with_extras(&extras.value) {
             Ok(made) => _ = commands.entity(node).insert(made),
-            Err(error) => bake.told = Some(format!("no body: {error}")),
+            Err(error) => bake.wrong.push(format!("no body: {error}")),
         }
     }
 }
@@ -125,24 +134,44 @@ fn nudge(
 
 fn write(
     mut commands: Commands,
+    assets: Res<AssetServer>,
     mut bake: ResMut<Bake>,
     bodies: Query<&BodyState>,
+    nodes: Query<(), With<BakeNode>>,
     awaited: Query<Entity, With<Awaited>>,
     mut readout: ResMut<Readout>,
 ) {
-    if bake.told.is_none() && !bodies.is_empty() {
-        let coordinates: usize = bodies.iter().map(|state| state.model().mode_count()).sum();
-        let mass: f64 = bodies.iter().map(|state| state.model().mass()).sum();
-        bake.told = Some(format!(
-            "baked in    {:.1} s\nbodies      {}\nmass        {mass:.2} kg\ncoordinates {coordinates}",
-            bake.begun.elapsed().as_secs_f64(),
-            bodies.iter().len(),
-        ));
+    let bake = &mut *bake;
+    if bodies.iter().len() > bake.bodies.0 {
+        bake.bodies = (bodies.iter().len(), bake.begun.elapsed().as_secs_f64());
     }
-    if bake.told.is_some() {
+    if let LoadState::Failed(error) = assets.load_state(&bake.scene)
+        && bake.wrong.is_empty()
+    {
+        // What follows the first line is for those who mend the loader.
+        let text = error.to_string();
+        bake.wrong.push(format!("no model: {}", text.lines().next().unwrap_or_default()));
+    }
+    bake.frames += u32::from(assets.is_loaded_with_dependencies(&bake.scene));
+    if bake.frames == 60 && nodes.is_empty() && bodies.is_empty() && bake.wrong.is_empty() {
+        let text = "no body: no object has the custom property `stiffness`, or the export left them out";
+        bake.wrong.push(text.into());
+    }
+    if bake.bodies.0 > 0 || !bake.wrong.is_empty() {
         awaited.iter().for_each(|entity| _ = commands.entity(entity).remove::<Awaited>());
     }
-    let text = bake.told.clone().unwrap_or_else(|| format!("{} is being baked", bake.file));
+    let mut lines = bake.wrong.clone();
+    if bake.bodies.0 > 0 {
+        let coordinates: usize = bodies.iter().map(|state| state.model().mode_count()).sum();
+        let mass: f64 = bodies.iter().map(|state| state.model().mass()).sum();
+        let (count, took) = bake.bodies;
+        lines.push(format!(
+            "baked in    {took:.1} s\nbodies      {count}\nmass        {mass:.2} kg\ncoordinates {coordinates}"
+        ));
+    } else if lines.is_empty() {
+        lines.push(format!("{} is being baked", bake.file));
+    }
+    let text = lines.join("\n");
     if readout.0 != text {
         readout.0 = text;
     }

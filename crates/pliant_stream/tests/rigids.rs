@@ -368,8 +368,8 @@ fn a_jump_is_shown_as_one() {
     }
 }
 
-/// A host that pauses and goes on: what moves stands within a quarter of a second, and goes on at
-/// once, from where it stood.
+/// A host that pauses and goes on: what moves stands within a quarter of a second, and when the
+/// host goes on it does so at once, from where it was at the host.
 #[test]
 fn a_pause_of_the_host_is_a_pause_here() {
     let states = |tick: u64| {

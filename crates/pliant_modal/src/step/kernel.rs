@@ -440,6 +440,7 @@ impl Kernel {
         contacts: &mut Contacts,
     ) -> Result<StepReport, StepError> {
         if contacts.obstacles().is_empty() {
+            self.check_step(state, hands)?;
             contacts.end();
             let stepped = self.step(state, hands, load);
             if let Err(StepError::Diverged { .. }) = stepped {

@@ -31,7 +31,8 @@ pub struct HostSessionConfig {
     ///
     /// Beyond this rate, or when a guest's round trip grows by 50 ms over its minimum, the guest
     /// gets fewer repeats, then fewer refreshes, and of a stream of accelerations then fewer modes.
-    /// No tick is dropped. Default: 1 Mbit/s.
+    /// Rigid bodies take half of the rate at most, and at each level half of that before.
+    /// No tick of a body is dropped. Default: 1 Mbit/s.
     pub guest_rate: f64,
     /// Delay of the answers to NACKs, to reproduce the figures of the paper. Default: 0, answers
     /// are sent at once.

@@ -27,7 +27,8 @@ const SHARE: f64 = 0.5;
 /// The bytes that rigid bodies may take of a guest's rate (bit/s).
 pub(super) fn rigid_budget(guest_rate: f64) -> Budget {
     let rate = (SHARE / 8.0 * guest_rate).min(1e12);
-    Budget::new(rate, rate.clamp(2048.0, 65_536.0))
+    // A tenth of a second at once: where all of a crowd begin to move, no queue comes of it.
+    Budget::new(rate, (0.1 * rate).clamp(2048.0, 65_536.0))
 }
 
 #[derive(Debug, Default)]
