@@ -78,8 +78,7 @@ fn each_plugin_brings_its_own_systems_and_no_other() {
             app.add_plugins((PliantBodyPlugin::default(), NetPlugin::host(HostConfig::default()).unwrap()));
         };
         let net = with(host) - none - body;
-        // Two of them for rigid bodies.
-        assert!((1..=14).contains(&net), "{net} systems of the network");
+        assert!((1..=12).contains(&net), "{net} systems of the network");
     }
     #[cfg(feature = "haptics")]
     {

@@ -182,13 +182,12 @@ impl Plugin for NetPlugin {
                 PostUpdate,
                 (
                     host::finish.run_if(resource_exists::<NetHost>),
-                    (guest::send_hands, guest::show, guest::show_rigids)
+                    (guest::send_hands, guest::show)
                         .chain()
                         .in_set(NetSystems::Show)
                         .before(PliantDisplaySystems::Interpolate)
                         .run_if(resource_exists::<NetGuest>),
-                    (guest::look, guest::send_interest)
-                        .chain()
+                    guest::send_interest
                         .after(VisibilitySystems::UpdateFrusta)
                         .run_if(resource_exists::<NetGuest>),
                     (peer::send_hands, peer::show)

@@ -80,16 +80,17 @@ impl Interest {
     }
 }
 
-/// `PostUpdate`: sets the interests from the cameras, if [`CameraInterest`] is on.
-pub(crate) fn look(
+/// `PostUpdate`: sets the interests from the cameras, if [`CameraInterest`] is on, and sends those
+/// that have changed to the host.
+pub(crate) fn send_interest(
     guest: Option<ResMut<NetGuest>>,
     cameras: Query<(&Camera, &Projection, &GlobalTransform, &Frustum)>,
-    mut bodies: Query<(&RemoteBody, &BodyState, &GlobalTransform, Option<&Grabs>, &mut Interest)>,
+    mut bodies: Query<(&RemoteBody, &mut Interest, Option<(&BodyState, &GlobalTransform)>, Option<&Grabs>)>,
 ) {
     let Some(mut guest) = guest else { return };
-    let Some(config) = guest.config.interest else { return };
     let now = guest.now();
-    for (body, state, place, grabs, mut interest) in &mut bodies {
+    for (body, mut interest, there, grabs) in &mut bodies {
+        let (Some(config), Some((state, place))) = (guest.config.interest, there) else { continue };
         let model = state.model();
         let (scale, ..) = place.to_scale_rotation_translation();
         let radius = 0.5 * model.size() as f32 * scale.x;
@@ -115,6 +116,10 @@ pub(crate) fn look(
             interest.set_if_neq(worth);
         }
     }
+    let Some(session) = &mut guest.session else { return };
+    for (body, interest, ..) in &bodies {
+        session.set_interest(body.0, interest.modes());
+    }
 }
 
 /// Returns the part of the view's height that a sphere takes.
@@ -124,15 +129,6 @@ fn height_in(lens: &Projection, distance: f32, radius: f32) -> f32 {
         Projection::Orthographic(lens) => 2.0 * radius / lens.area.height().max(1e-6),
         // The size under an unknown projection is unknown, so all modes are requested.
         Projection::Custom(_) => f32::INFINITY,
-    }
-}
-
-/// `PostUpdate`, after [`look`]: sends changed subscriptions to the host.
-pub(crate) fn send_interest(guest: Option<ResMut<NetGuest>>, bodies: Query<(&RemoteBody, &Interest)>) {
-    let Some(mut guest) = guest else { return };
-    let Some(session) = &mut guest.session else { return };
-    for (body, interest) in &bodies {
-        session.set_interest(body.0, interest.modes());
     }
 }
 

@@ -34,9 +34,8 @@ use rigids::FollowedRigid;
 use source::Source;
 
 pub(crate) use hands::send_hands;
+pub(crate) use interest::send_interest;
 pub use interest::{CameraInterest, Interest};
-pub(crate) use interest::{look, send_interest};
-pub(crate) use rigids::show_rigids;
 pub(crate) use session::receive;
 pub(crate) use show::show;
 

@@ -1,13 +1,14 @@
 //! The host's rigid bodies, and the entities that follow them.
 
 use bevy::prelude::*;
-use pliant_stream::RigidId;
+use pliant_stream::{GuestSession, RigidId};
 
 use super::NetGuest;
 use crate::remote::{RigidArrived, RigidLeft};
 use crate::session::{SessionEvent, queue_event};
 use crate::session_transform::set_pose;
 use crate::shared_body::{RemoteRigid, SharedRigid};
+use crate::view::DisplayedBodies;
 
 /// The entity that follows a rigid body of the host.
 #[derive(Debug, Clone)]
@@ -79,17 +80,16 @@ fn take_leave(world: &mut World, followed: FollowedRigid) {
     queue_event(world, SessionEvent::RigidLeft(RigidLeft { entity, name }));
 }
 
-/// `PostUpdate`: puts the entities where the session shows their rigid bodies.
-pub(crate) fn show_rigids(
-    guest: Option<Res<NetGuest>>,
-    rigids: Query<(Entity, &RemoteRigid, Option<&ChildOf>)>,
-    mut places: ParamSet<(TransformHelper, Query<&mut Transform>)>,
+/// Puts the entities where the session shows their rigid bodies.
+pub(super) fn show_rigids(
+    session: &GuestSession,
+    rigids: &Query<(Entity, &RemoteRigid, Option<&ChildOf>)>,
+    places: &mut ParamSet<(DisplayedBodies, TransformHelper, Query<&mut Transform>)>,
 ) {
-    let Some(session) = guest.as_ref().and_then(|guest| guest.session()) else { return };
-    for (entity, id, child) in &rigids {
+    for (entity, id, child) in rigids {
         let Some(shown) = session.rigid(id.0).map(|rigid| rigid.shown()) else { continue };
-        let parent = child.map(|child| places.p0().compute_global_transform(child.parent()));
-        let mut all = places.p1();
+        let parent = child.map(|child| places.p1().compute_global_transform(child.parent()));
+        let mut all = places.p2();
         let Ok(mut transform) = all.get_mut(entity) else { continue };
         let mut place = *transform;
         set_pose(&mut place, &shown, &shown, 0.0, 1.0);

@@ -7,15 +7,18 @@ use pliant_body::{GrabForce, HeldShapesCache, ModalBody};
 use pliant_stream::{BodyId, GuestSession};
 
 use super::bodies::FollowedBody;
+use super::rigids::show_rigids;
 use super::{NetGuest, visual_state_of};
 use crate::session_transform::SessionTransform;
+use crate::shared_body::RemoteRigid;
 use crate::user::UserLink;
 use crate::view::{DisplayedBodies, remote_hands};
 
 /// `PostUpdate`: brings the session to the current time and writes what it displays.
 pub(crate) fn show(
     guest: Option<ResMut<NetGuest>>,
-    mut bodies: DisplayedBodies,
+    mut places: ParamSet<(DisplayedBodies, TransformHelper, Query<&mut Transform>)>,
+    rigids: Query<(Entity, &RemoteRigid, Option<&ChildOf>)>,
     mut forces: Query<&mut GrabForce>,
     mut links: Query<&mut UserLink>,
     wanted: Query<&ModalBody>,
@@ -35,6 +38,7 @@ pub(crate) fn show(
     // In a replay no hand is local, so all hands are shown as remote.
     let user = session.user().filter(|_| !guest.source.is_replay());
     let step = session.step();
+    let mut bodies = places.p0();
     for (&id, followed) in &mut guest.bodies {
         let Some(view) = session.body(id) else { continue };
         let Ok((state, mut visual, mut hands, mut transform, global)) = bodies.get_mut(followed.entity)
@@ -59,6 +63,7 @@ pub(crate) fn show(
         }
     }
     shape_held(session, &guest.bodies, &bodies, &wanted, cache);
+    show_rigids(session, &rigids, &mut places);
     let link = session.stats();
     let own = user.and_then(|user| guest.users.get(user));
     if let Some(mut shown) = own.and_then(|own| links.get_mut(own).ok()) {
