@@ -52,6 +52,8 @@ struct Bake {
     begun: Instant,
     /// Bodies that are there, and the time until the last one was, s.
     bodies: (usize, f64),
+    /// Nodes that are to be bodies.
+    asked: usize,
     /// Frames since the file was read.
     frames: u32,
     wrong: Vec<String>,
@@ -79,6 +81,7 @@ fn main() -> AppExit {
         tets: options.tets,
         begun: Instant::now(),
         bodies: (0, 0.0),
+        asked: 0,
         frames: 0,
         wrong: Vec::new(),
     };
@@ -105,7 +108,10 @@ fn bake_what_says_so(
 ) {
     for (node, extras) in nodes.iter().filter(|(_, extras)| extras.value.contains("stiffness")) {
         match (BakeNode { tets: bake.tets, ..default() }).with_extras(&extras.value) {
-            Ok(made) => _ = commands.entity(node).insert(made),
+            Ok(made) => {
+                bake.asked += 1;
+                commands.entity(node).insert(made);
+            }
             Err(error) => bake.wrong.push(format!("no body: {error}")),
         }
     }
@@ -137,7 +143,6 @@ fn write(
     assets: Res<AssetServer>,
     mut bake: ResMut<Bake>,
     bodies: Query<&BodyState>,
-    nodes: Query<(), With<BakeNode>>,
     awaited: Query<Entity, With<Awaited>>,
     mut readout: ResMut<Readout>,
 ) {
@@ -153,7 +158,7 @@ fn write(
         bake.wrong.push(format!("no model: {}", text.lines().next().unwrap_or_default()));
     }
     bake.frames += u32::from(assets.is_loaded_with_dependencies(&bake.scene));
-    if bake.frames == 60 && nodes.is_empty() && bodies.is_empty() && bake.wrong.is_empty() {
+    if bake.frames == 60 && bake.asked == 0 && bake.wrong.is_empty() {
         let text = "no body: no object has the custom property `stiffness`, or the export left them out";
         bake.wrong.push(text.into());
     }
