@@ -1,6 +1,5 @@
 //! Tests that a glTF file, as Blender exports it, becomes a body that keeps what the file says:
 //! material and anchors of the body, and the materials of its surface.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 #[path = "blender/mod.rs"]
 mod bud;

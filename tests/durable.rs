@@ -2,7 +2,6 @@
 //! name, and its folder afterwards. A library before the C library of a process of its own sees the
 //! calls.
 #![cfg(target_os = "linux")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::{
     path::{Path, PathBuf},
@@ -51,7 +50,7 @@ fn files_are_synced_before_they_get_their_names() {
     let files = files.canonicalize().unwrap();
     let log = folder.join("log");
     let child = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "files_are_written", "--ignored"])
+        .args(["--exact", "durable::files_are_written", "--ignored"])
         .env("LD_PRELOAD", witness(&folder))
         .env("PLIANT_WITNESS", &log)
         .env(FOLDER, &files)

@@ -1,5 +1,4 @@
 //! Tests that all machines of a session step a body with the same gravity, over real QUIC.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{
     path::Path,

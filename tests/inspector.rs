@@ -1,6 +1,5 @@
 //! Tests that what users meet can be looked at and set in `bevy-inspector-egui`: each component and
 //! resource, with all of its fields, and a body with a hand while it moves.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use bevy::{
     ecs::reflect::{AppTypeRegistry, ReflectComponent, ReflectResource},

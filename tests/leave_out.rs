@@ -2,7 +2,6 @@
 //!
 //! A plugin that is left out adds no system. A body that nothing touches causes no step, state,
 //! message or mesh.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{path::PathBuf, time::Duration};
 

@@ -1,6 +1,5 @@
 //! Tests that what users meet is data as Bevy has it: registered for reflection, so that it can be
 //! saved, cloned, looked at in an inspector and named in a scene.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{fs, path::Path};
 

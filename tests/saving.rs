@@ -1,5 +1,4 @@
 //! Tests that a scene of live bodies can be saved as Bevy saves worlds, and goes on from there.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,4 @@
 //! Tests the errors for invalid scenes and the entities of valid ones.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod mistakes;
 mod needs;

@@ -1,8 +1,6 @@
 //! Tests the public bake: the contents of a model, the refused inputs, and bit-identical results
 //! for the same input.
 
-#![expect(clippy::unwrap_used, reason = "a failed test should panic")]
-
 use pliant_bake::{Anchor, Bake, BakeConfig, BakeError, bake};
 use pliant_mesh::{MeshError, Surface, TetMesh, shapes};
 use pliant_modal::{Damping, Element, ModalModel};

@@ -1,5 +1,4 @@
 //! Contacts with known answers: rest, inclines, rolling, toppling, impact and Hertz.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

@@ -1,6 +1,5 @@
 //! Bakes and drags the paper's bar. The reaction must be smooth where the rigid constraint of the
 //! paper's equation (4) flips its sign in every step.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

@@ -1,8 +1,6 @@
 //! Free bodies of reduced elasticity between hands: the frame and the elastic coordinates are
 //! stepped by turns, and what that costs in force, calm, momentum and energy.
 
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
-
 use std::sync::Arc;
 
 use pliant_bake::{Bake, BakeConfig, Material, PrescribedPatch, StaticLoads, bake, deflect};

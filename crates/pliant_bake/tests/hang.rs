@@ -1,5 +1,4 @@
 //! Tests a slender bar that is fixed at one end and hangs under its own weight.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

@@ -1,7 +1,5 @@
 //! Hands whose patches have their own shapes, against full nonlinear solutions.
 
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
-
 use std::sync::Arc;
 
 use pliant_bake::{Bake, BakeConfig, Material, PrescribedPatch, StaticLoads, bake, deflect};

@@ -1,6 +1,5 @@
 //! The moments with which the anchors' motion drives a baked body, against integrals over its mesh
 //! and closed forms.
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
 
 use std::{path::Path, sync::Arc};
 

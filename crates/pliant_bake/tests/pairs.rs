@@ -1,5 +1,4 @@
 //! Bodies that touch each other, with known answers: momentum, energy, Hertz, weight and stacks.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Probes that press and stroke, with known answers: springs, full solutions, Coulomb, momentum.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

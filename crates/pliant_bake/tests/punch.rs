@@ -1,6 +1,5 @@
 //! A flat punch pressed on a block, against the full solution by finite elements and against the
 //! formula of a half-space.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

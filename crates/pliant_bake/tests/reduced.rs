@@ -1,8 +1,6 @@
 //! Bodies with reduced elasticity against full nonlinear solutions and published values.
 
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
-
-mod uniaxial;
+use crate::uniaxial;
 
 use std::sync::Arc;
 

@@ -1,7 +1,5 @@
 //! Motion of bodies with reduced elasticity: struck modes, and tangents that are not positive.
 
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
-
 use std::sync::Arc;
 
 use nalgebra::DMatrix;

@@ -1,7 +1,5 @@
 //! Bodies of several materials, against closed forms and full solutions.
 
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
-
 use std::sync::Arc;
 
 use pliant_bake::{

@@ -1,5 +1,4 @@
 //! Rigid bodies of another engine that touch soft ones: weight at all ratios of the masses.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Tests the static stiffness under a hand between the baked sites against the full solution.
-#![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, shapes};

@@ -3,8 +3,6 @@
 //! The frequency of a blade is proportional to its thickness, so the 2 % by which a filled volume
 //! may be off allow 2 % of the frequency. Half of it is asked: thickness must also be where it is.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
-
 use std::f64::consts::TAU;
 
 use pliant_bake::{BakeConfig, bake};

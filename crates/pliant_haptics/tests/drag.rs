@@ -1,8 +1,7 @@
 //! Dragging a body with the virtual device. The tests check the guarantees of the table
 //! (`--example drag_table`) for some of its cells.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod rig;
+use crate::rig;
 
 use std::sync::Arc;
 

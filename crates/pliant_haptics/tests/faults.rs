@@ -1,8 +1,7 @@
 //! Faults of a device, a driver, a game or a network. The force fades, never kicks, and comes back
 //! by the ramp.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod rig;
+use crate::rig;
 
 use std::{
     cell::Cell,

@@ -1,8 +1,7 @@
 //! Changes of the held patches during a grab: other grabs, another copy of the body, another
 //! device. The force is neither cut nor does it jump.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod rig;
+use crate::rig;
 
 use std::sync::{
     Arc,

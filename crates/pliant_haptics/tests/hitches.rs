@@ -1,8 +1,7 @@
 //! Hitches: the simulation, or the whole process, stands still for 0.05 to 1 s, again and again,
 //! while the hand goes on. What is felt fades, and never rises faster than the device's slew limit.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod rig;
+use crate::rig;
 
 use nalgebra::Vector3;
 use pliant_haptics::{HandModel, SafetyConfig, Scheduler, VirtualConfig};

@@ -1,6 +1,5 @@
 //! Devices, tools and grips in an app without a window.
 #![cfg(feature = "plugin")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::{
     sync::{
@@ -21,11 +20,9 @@ use pliant_haptics::{
     ToolPose, ToolTouch, VirtualConfig, VirtualDevice, VirtualHandle, Wrench,
 };
 
-#[path = "rig/block.rs"]
-mod block;
+use crate::rig::block;
 
-#[path = "rig/machine.rs"]
-mod machine;
+use crate::rig::machine;
 
 /// Creates an app with fixed steps of 0.01 s in real time, because the loop's thread uses a real
 /// clock.

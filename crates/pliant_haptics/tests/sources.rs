@@ -1,7 +1,6 @@
 //! Bevy's input moves a device through its source, and the tests read the position from the
 //! device's loop.
 #![cfg(feature = "plugin")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::time::Duration;
 
@@ -28,10 +27,8 @@ use pliant_haptics::{
     Positioned, PositionedHandle,
 };
 
-#[path = "rig/block.rs"]
-mod block;
-#[path = "rig/machine.rs"]
-mod machine;
+use crate::rig::block;
+use crate::rig::machine;
 
 /// Simulated time of a frame, s, whatever real time the machine takes.
 const FRAME: f64 = 0.01;

@@ -1,8 +1,7 @@
 //! Stability limits of control theory, reproduced by experiment with the real loop core in virtual
 //! time.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod rig;
+use crate::rig;
 
 use pliant_haptics::{HandModel, VirtualConfig};
 use rig::Rig;

@@ -1,14 +1,12 @@
 //! Behavior of a tool with held patches: torque from several grabs, masks, scales, weight, a body
 //! that is stepped elsewhere, two devices.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_haptics::{
     Coupling, DeviceInfo, HandModel, HapticDevice, LocalModel, LoopConfig, LoopCore, ModelWriter,
     PublishedGrab, Sample, ToolContact, ToolMap, VirtualConfig, VirtualDevice,
 };
 
-#[path = "rig/machine.rs"]
-mod machine;
+use crate::rig::machine;
 
 /// Returns a device of six degrees of freedom that the test moves.
 fn six() -> DeviceInfo {

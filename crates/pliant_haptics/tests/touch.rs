@@ -1,7 +1,6 @@
 //! A tool's ball that touches in the loop, with a virtual device in virtual time.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod rig;
+use crate::rig;
 
 use std::sync::Arc;
 

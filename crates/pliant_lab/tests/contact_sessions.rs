@@ -1,7 +1,6 @@
 //! Sessions of bodies that fall onto a floor and onto each other, over the paper's worst network.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -1,5 +1,4 @@
 //! Tests what `pliant drop` measures.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

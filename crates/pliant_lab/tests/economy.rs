@@ -1,7 +1,6 @@
 //! Cost of a session: resting bodies, weak guests, small datagrams and low bandwidth.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

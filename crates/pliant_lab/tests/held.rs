@@ -1,7 +1,6 @@
 //! Guests show the own shapes of the patch that a hand holds as the host has them.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::sync::Arc;
 use std::time::Duration;

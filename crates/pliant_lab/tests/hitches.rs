@@ -7,9 +7,8 @@
 //! the host makes of the same target counts too: the last second begins one second before the
 //! reaction is shown, and ends six ticks after the host has played the target that the hand then
 //! has.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::collections::BTreeMap;
 use std::ops::Range;

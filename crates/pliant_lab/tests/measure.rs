@@ -2,9 +2,8 @@
 //!
 //! `cargo test -p pliant_lab --test measure -- --ignored --nocapture` runs the long form: ten
 //! minutes, many seeds and all policies.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};

@@ -1,6 +1,5 @@
 //! Peers step a held body of reduced elasticity with the same own shapes of its patches at the same
 //! tick.
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -1,7 +1,6 @@
 //! Tests of the predicted hand: the guest's own copy of a body that answers the local hand at once.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -1,7 +1,6 @@
 //! Size and error of quantized frames, and the traffic of a guest's hand.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -1,5 +1,4 @@
 //! Sessions with bodies of reduced elasticity: the stream carries them as it carries linear ones.
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -1,8 +1,7 @@
 //! Bodies that relax: the viscoelastic state streams, recovers and decays like the rest of the
 //! state.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -1,7 +1,6 @@
 //! Sessions: joining, joining late, leaving, models, and bodies that are added and removed.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::collections::BTreeSet;
 use std::time::Duration;

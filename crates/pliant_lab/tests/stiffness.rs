@@ -1,7 +1,6 @@
 //! A body whose stiffness changes while it is streamed: guests are notified and keep their grabs.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use pliant_modal::{BodyConfig, StepSettings};
 use pliant_stream::{GuestEvent, GuestSessionConfig, HostSessionConfig};

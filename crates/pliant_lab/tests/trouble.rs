@@ -1,7 +1,6 @@
 //! Sessions under disturbances: outages, pauses, scattered frames and unexplained forces.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

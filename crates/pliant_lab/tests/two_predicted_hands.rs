@@ -5,9 +5,8 @@
 //! predicted copy with the local hand, and the streamed state taken for the newer tick, which is
 //! what a game without prediction shows. The copy cannot know when the other hand releases the
 //! body.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::sync::Arc;
 use std::time::Duration;

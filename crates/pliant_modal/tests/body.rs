@@ -1,8 +1,7 @@
 //! Tests of a body that is held, pulled, thrown and given bad inputs, against a rod with
 //! closed-form solutions.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a failed test should panic")]
 
-mod rod;
+use crate::rod;
 
 use std::sync::Arc;
 

@@ -1,5 +1,4 @@
 //! Hands with dampers: a damper has no static force and removes energy.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

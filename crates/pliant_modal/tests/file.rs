@@ -1,8 +1,7 @@
 //! The `.modal` file: round trip and all kinds of invalid files.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
-mod nonlinear_rod;
-mod rod;
+use crate::nonlinear_rod;
+use crate::rod;
 
 use nonlinear_rod::nonlinear_rod;
 use pliant_modal::{FileError, Material, ModalModel, ModelParts, ReducedElasticity};

@@ -2,9 +2,8 @@
 //!
 //! The true forces are chosen. The accelerations that they give follow from the equation of motion
 //! of each mode and from the model's mode shapes, without the code under test.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
-mod rod;
+use crate::rod;
 
 use std::sync::Arc;
 

@@ -1,8 +1,7 @@
 //! Bodies whose anchors move, against closed forms.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
-mod nonlinear_rod;
-mod rod;
+use crate::nonlinear_rod;
+use crate::rod;
 
 use std::{f64::consts::TAU, sync::Arc};
 

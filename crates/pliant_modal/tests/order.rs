@@ -1,8 +1,7 @@
 //! Order of accuracy of the reaction, compared with the modal equations integrated in very small
 //! steps.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
-mod rod;
+use crate::rod;
 
 use std::sync::Arc;
 

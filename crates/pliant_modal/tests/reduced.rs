@@ -1,8 +1,7 @@
 //! Reduced elasticity in closed form: a rod whose material is a spring along it.
-#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
 
-mod nonlinear_rod;
-mod rod;
+use crate::nonlinear_rod;
+use crate::rod;
 
 use std::sync::Arc;
 

@@ -1,7 +1,6 @@
 //! Viscoelastic bodies, compared with the closed forms of the standard linear solid.
-#![allow(clippy::unwrap_used, reason = "a failed test should panic")]
 
-mod rod;
+use crate::rod;
 
 use std::sync::Arc;
 

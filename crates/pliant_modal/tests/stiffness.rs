@@ -1,8 +1,7 @@
 //! The stiffness scale of a body, compared with a rod of the scaled Young's modulus and with closed
 //! forms.
-#![allow(clippy::unwrap_used, reason = "a failed test should panic")]
 
-mod rod;
+use crate::rod;
 
 use std::sync::Arc;
 

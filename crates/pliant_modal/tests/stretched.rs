@@ -1,6 +1,5 @@
 //! A free body between two hands that pull apart. The tension keeps the body in line between the
 //! hands, and the body comes to rest.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 

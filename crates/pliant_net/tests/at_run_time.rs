@@ -1,7 +1,6 @@
 //! Tests of sessions that are begun and left while the apps run.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::Arc;

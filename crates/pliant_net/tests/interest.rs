@@ -1,8 +1,7 @@
 //! Tests of a scene with a camera: visible bodies are sent, invisible ones are not, and distant
 //! ones are sent with fewer modes.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::path::Path;
 use std::sync::Arc;

@@ -1,7 +1,6 @@
 //! Tests of peers with an unauthenticated peer, which writes the peers' messages itself.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};

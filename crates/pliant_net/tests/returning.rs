@@ -1,7 +1,6 @@
 //! Tests of guests and hosts that leave or fail, and come back.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::net::SocketAddr;
 use std::sync::Arc;

@@ -1,7 +1,6 @@
 //! Rigid bodies of a host's app on a guest, over real QUIC on loopback.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use bevy::prelude::*;
 use pliant_body::PliantTick;

@@ -1,7 +1,6 @@
 //! Tests of two and three apps that hold one body over real QUIC on loopback.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};

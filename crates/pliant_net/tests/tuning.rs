@@ -1,8 +1,7 @@
 //! Tests of bodies whose settings change while they are shared, and of sessions that end
 //! deliberately.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -2,13 +2,10 @@
 //!
 //! The relay is in this process. Where `PLIANT_MOQ_RELAY` names the program `moq-relay`, the test
 //! `the_same_through_a_real_relay` runs with it, too.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-#[path = "support/relay.rs"]
-mod relay;
-mod support;
-#[path = "support/watching.rs"]
-mod watching;
+use crate::relay;
+use crate::support;
+use crate::watching;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

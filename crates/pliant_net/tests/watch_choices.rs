@@ -1,12 +1,9 @@
 //! What a host chooses for its watchers while they watch: where bodies are and how they look, what
 //! is hidden, and what a relay's lies may cost them.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-#[path = "support/relay.rs"]
-mod relay;
-mod support;
-#[path = "support/watching.rs"]
-mod watching;
+use crate::relay;
+use crate::support;
+use crate::watching;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

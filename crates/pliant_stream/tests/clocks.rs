@@ -1,7 +1,6 @@
 //! Clocks that differ by years. Sessions use only elapsed time, never absolute time.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::collections::BTreeMap;
 use std::time::Duration;

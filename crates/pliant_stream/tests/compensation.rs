@@ -1,5 +1,4 @@
 //! Tests the paper's compensation against direct integration.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::{AccelerationDriven, History, Recovery};

@@ -1,5 +1,4 @@
 //! Checks that the network emulator matches its settings.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::time::Duration;
 

@@ -1,9 +1,8 @@
 //! A guest that sends as much as it can costs the host a bounded amount of work, and bars nobody.
 //! The work is counted, since times depend on the machine. The last test measures times, and is run
 //! by hand.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};

@@ -1,8 +1,7 @@
 //! Lying peers and jumping clocks. Memory stays bounded, and sessions continue or end with a
 //! reason.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -1,7 +1,6 @@
 //! Bodies that a guest does not look at are not sent. A guest that reconnects gets its old number.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

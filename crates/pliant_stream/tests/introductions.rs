@@ -1,8 +1,7 @@
 //! Peers tell each other with whom they are connected, so that two that have lost each other find
 //! each other again.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -1,7 +1,6 @@
 //! Peers with so many bodies that a state of all of them does not fit into one message.
-#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

@@ -1,9 +1,8 @@
 //! A peer whose inputs come as late as can be, with new patches in each, costs the others a bounded
 //! amount of work, and all agree soon after. The work is counted, since times depend on the
 //! machine.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::{Duration, Instant};
 

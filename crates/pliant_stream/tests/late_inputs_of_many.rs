@@ -1,8 +1,7 @@
 //! A crowd of peers that hold one body with many hands, and whose inputs come late, costs a peer no
 //! more in an update than a few steps, and all agree soon after.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::{Duration, Instant};
 

@@ -1,8 +1,7 @@
 //! No datagram exceeds the size limit of the path, for any number of modes and hands and any
 //! policy. Rounding errors are equal on the surface.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::time::Duration;
 

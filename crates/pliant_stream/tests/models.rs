@@ -1,8 +1,7 @@
 //! Models sent to many guests at once: one rate for all, in fair turns, within each connection's
 //! capacity.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::collections::BTreeMap;
 use std::time::Duration;

@@ -1,7 +1,5 @@
 //! Links among peers: paths that carry too little, and peers that fall silent.
 
-#![allow(clippy::unwrap_used, reason = "a failed test should panic")]
-
 use std::time::Duration;
 
 use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig};

@@ -1,8 +1,5 @@
 //! Rigid bodies of the host's game, as guests see them. What they should show is known in closed
 //! form.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
-
-mod support;
 
 use std::collections::VecDeque;
 use std::time::Duration;

@@ -1,7 +1,6 @@
 //! What watchers get: frames come back as they were, bytes against error, and hostile bytes.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-mod support;
+use crate::support;
 
 use std::sync::Arc;
 

@@ -11,8 +11,8 @@ use pliant_net::transport::{
 use pliant_stream::DisconnectReason;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 
-use crate::endpoints::{closed, connected, datagram, guest, host, message, patient};
-use crate::wait::{must, wait_for};
+use super::endpoints::{closed, connected, datagram, guest, host, message, patient};
+use crate::support::wait::{must, wait_for};
 
 #[test]
 fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {

@@ -7,7 +7,7 @@ use pliant_net::transport::{
     Carrier, DisconnectReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
 };
 
-use crate::wait::wait_for;
+use crate::support::wait::wait_for;
 
 /// Waits for the next event that `wanted` accepts, and skips the others.
 pub fn next<T>(endpoint: &Endpoint, mut wanted: impl FnMut(Event) -> Option<T>) -> T {

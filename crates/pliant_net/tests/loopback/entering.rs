@@ -11,8 +11,8 @@ use pliant_net::transport::{
 use pliant_stream::DisconnectReason;
 use pliant_stream::wire::PROTOCOL_VERSION;
 
-use crate::endpoints::{closed, connected, guest, host, is_first_heard_of, message, next};
-use crate::unauthenticated::UnauthenticatedPeer;
+use super::endpoints::{closed, connected, guest, host, is_first_heard_of, message, next};
+use super::unauthenticated::UnauthenticatedPeer;
 
 #[test]
 fn another_key_than_the_invites_is_refused() {

@@ -10,9 +10,9 @@ use pliant_net::transport::{
 };
 use pliant_stream::DisconnectReason;
 
-use crate::endpoints::{closed, connected, datagram, guest, host, message, patient, quick};
-use crate::unauthenticated::UnauthenticatedPeer;
-use crate::wait::{must, wait_for};
+use super::endpoints::{closed, connected, datagram, guest, host, message, patient, quick};
+use super::unauthenticated::UnauthenticatedPeer;
+use crate::support::wait::{must, wait_for};
 
 #[test]
 fn a_message_over_the_limit_ends_the_connection_of_its_sender_only() {
@@ -63,7 +63,7 @@ fn garbage_on_the_port_disturbs_nobody() {
 fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
     let host =
         Endpoint::host(HostOptions { limits: quick(Limits::host()), ..HostOptions::default() }).unwrap();
-    let patient = crate::endpoints::host();
+    let patient = super::endpoints::host();
     let start = Instant::now();
     let unauthenticated = UnauthenticatedPeer::new(ALPN, true);
     let connections = [&patient, &host].map(|host| {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use pliant_net::transport::Endpoint;
 
-use crate::wait::{Look, wait_for};
+use crate::support::wait::{Look, wait_for};
 
 /// A guest built directly on quinn, which can do things that this crate's guests never do.
 pub struct UnauthenticatedPeer {

@@ -1,7 +1,7 @@
 //! Apps that share a body over loopback, and a body whose modes are known in closed form.
 #![allow(dead_code, unused_imports, reason = "each test uses its part")]
 
-mod wait;
+pub mod wait;
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

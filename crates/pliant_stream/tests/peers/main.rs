@@ -1,6 +1,5 @@
 //! Three equal peers over bad paths: they agree on one shape, apply their own hands at once and
 //! correct all errors.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod agreement;
 mod compensation;
@@ -10,8 +9,7 @@ mod mesh;
 mod messages;
 mod repair;
 
-#[path = "../support/mod.rs"]
-mod support;
+use crate::support;
 
 use std::time::Duration;
 
