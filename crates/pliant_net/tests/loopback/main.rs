@@ -6,4 +6,3 @@ mod endpoints;
 mod entering;
 mod misbehaving;
 mod unauthenticated;
-use crate::support::wait;
