@@ -1,7 +1,7 @@
 //! Whole sessions over emulated paths, checked against the bounds of the design: 40 Hz, 120 modes.
 //!
-//! `cargo test -p pliant_lab --test measure -- --ignored --nocapture` runs the long form: ten
-//! minutes, many seeds and all policies.
+//! `cargo test -p pliant_lab --test suite measure:: -- --ignored --nocapture` runs the long form:
+//! ten minutes, many seeds and all policies.
 
 use crate::support;
 
