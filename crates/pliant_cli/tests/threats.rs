@@ -160,6 +160,49 @@ fn each_promise_is_held_by_a_test_or_the_page_says_that_none_does() {
     assert!(faults.is_empty(), "nothing that exists holds\n{}", faults.join("\n"));
 }
 
+/// The files that cargo does not make programs of by itself, and that no program names.
+fn left_out(files: &[String], text_of: impl Fn(&str) -> String) -> Vec<String> {
+    let mut lost = Vec::new();
+    for file in files {
+        let Some((folder, name)) = file.rsplit_once("tests/") else { continue };
+        let Some(name) = name.strip_suffix("/main.rs").or(name.strip_suffix(".rs")) else { continue };
+        if name.contains('/') || folder.contains("/src/") {
+            continue;
+        }
+        // The tests of whole apps belong to the package of the examples.
+        let package = if folder.is_empty() { "crates/pliant_examples/" } else { folder };
+        let manifest = text_of(&format!("{package}Cargo.toml"));
+        if !folder.is_empty() && !manifest.contains("autotests = false") {
+            continue;
+        }
+        let suite = text_of(&format!("{folder}tests/suite.rs"));
+        let module = suite.lines().any(|line| line == format!("mod {name};"));
+        let program = manifest.split("[[").filter(|part| part.starts_with("test]]")).any(|part| {
+            let names = |line: &str| line == format!("name = \"{name}\"");
+            part.lines().any(names)
+        });
+        if !module && !program {
+            lost.push(file.clone());
+        }
+    }
+    lost
+}
+
+#[test]
+fn each_test_file_belongs_to_a_program() {
+    let lost = left_out(&files(), read);
+    assert!(lost.is_empty(), "neither a module of a suite nor a [[test]]: {lost:?}");
+    // A file that nothing names is noticed.
+    let text = |name: &str| match name {
+        "crates/a/Cargo.toml" => "autotests = false\n[[test]]\nname = \"own\"\n".to_owned(),
+        "crates/a/tests/suite.rs" => "mod first;\n".to_owned(),
+        _ => String::new(),
+    };
+    let files = ["first.rs", "own/main.rs", "lost.rs", "lost/main.rs", "first/part.rs"];
+    let lost = left_out(&files.map(|file| format!("crates/a/tests/{file}")), text);
+    assert_eq!(lost, ["crates/a/tests/lost.rs", "crates/a/tests/lost/main.rs"]);
+}
+
 /// What reads the sources and the pages would notice a test that is gone.
 #[test]
 fn a_test_that_is_gone_or_is_not_run_is_noticed() {

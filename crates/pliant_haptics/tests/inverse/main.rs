@@ -6,8 +6,6 @@
 mod losses;
 mod service;
 
-#[path = "../../../pliant_lab/tests/support/fuzzing.rs"]
-mod fuzzing;
 #[path = "../rig/machine.rs"]
 mod machine;
 
@@ -153,31 +151,6 @@ fn nonsense_and_silence() {
     let nobody = machine::Nobody::new();
     let nobody = Inverse::open(InverseConfig { address: nobody.address.clone(), ..InverseConfig::default() });
     assert!(matches!(nobody, Err(InverseError::Connect { .. })), "{nobody:?}");
-}
-
-#[test]
-fn no_text_of_the_service_panics_the_driver() {
-    let service = Service::start(true);
-    let mut device = Inverse::open(second(service.config())).unwrap();
-    let mut scheduler = pacing();
-    let grip = r#"{"inverse3": [{"device_id": "049D", "state": {"cursor_position": {"x": 1e300, "y": -0.0,
-        "z": 5e-324}, "cursor_velocity": {"x": 1, "y": 2}}}], "verse_grip": [{"state": {"orientation": {"w": 1,
-        "x": 0, "y": 0, "z": 0}, "buttons": {"button_0": true, "button_1": false}}}]}"#;
-    let corpus = vec![state(&service.desk(), true).to_string().into_bytes(), grip.as_bytes().to_vec()];
-    // The target has no state of its own that an error could leave in two minds.
-    let device = std::cell::RefCell::new((&mut device, &mut scheduler));
-    fuzzing::run("inverse", corpus, |bytes| {
-        service.desk().say = Some(String::from_utf8_lossy(bytes).into_owned());
-        let (device, scheduler) = &mut *device.borrow_mut();
-        match device.exchange(&Wrench::ZERO, *scheduler) {
-            Ok(sample) => {
-                let numbers = sample.position.iter().chain(&sample.orientation);
-                assert!(numbers.chain(sample.velocity.iter().flatten()).all(|x| x.is_finite()));
-            }
-            Err(fault) => assert!(matches!(fault, Fault::Malformed | Fault::Gone), "{fault:?}"),
-        }
-    });
-    assert_eq!(service.desk().refused, [""; 0]);
 }
 
 /// Timeout for tests that wait until it expires, s.

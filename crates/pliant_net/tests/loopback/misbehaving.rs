@@ -12,6 +12,7 @@ use pliant_stream::DisconnectReason;
 
 use super::endpoints::{closed, connected, datagram, guest, host, message, patient, quick};
 use super::unauthenticated::UnauthenticatedPeer;
+use crate::support::alone;
 use crate::support::wait::{must, wait_for};
 
 #[test]
@@ -31,6 +32,7 @@ fn a_message_over_the_limit_ends_the_connection_of_its_sender_only() {
 
 #[test]
 fn garbage_on_the_port_disturbs_nobody() {
+    let _alone = alone();
     let host = host();
     let guest = guest(&host.invite());
     connected(&guest);
@@ -155,6 +157,7 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
 #[cfg_attr(not(target_os = "linux"), ignore = "needs 127.0.0.2 on the loopback interface")]
 #[test]
 fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
+    let _alone = alone();
     // Connections that have reached the handshake keep their places until the test is over, however
     // long it takes.
     let long = Duration::from_secs(600);

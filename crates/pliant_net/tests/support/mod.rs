@@ -115,7 +115,7 @@ pub fn patch_at_rest(vertex: u32, radius: f64) -> [f64; 3] {
     middle
 }
 
-/// Runs one test at a time, because the apps run in real time.
+/// Runs one test with apps at a time, because they run in real time.
 pub fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
