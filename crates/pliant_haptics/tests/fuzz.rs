@@ -7,7 +7,7 @@ mod fuzzing;
 #[path = "rig/machine.rs"]
 mod machine;
 #[path = "inverse/service.rs"]
-#[allow(dead_code, reason = "each test uses its part")]
+#[expect(dead_code, reason = "each test uses its part")]
 mod service;
 
 use pliant_haptics::{Fault, HapticDevice, Inverse, InverseConfig, LoopClock, RealScheduler, Wrench};

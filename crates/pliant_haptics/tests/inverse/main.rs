@@ -16,7 +16,7 @@ use pliant_haptics::{
     LoopEvent, RealScheduler, SafetyConfig, Sample, Spelling, StaleConfig, VirtualScheduler, Wrench,
 };
 
-use service::{Service, state};
+use service::Service;
 
 fn pacing() -> RealScheduler {
     RealScheduler::new(pliant_haptics::LoopClock::start(), 1000.0)
