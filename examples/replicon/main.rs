@@ -9,7 +9,7 @@
 //! - Host and guest are begun over the port's carriers by commands, any number of times.
 //!
 //! ```sh
-//! cargo run --release -p pliant_examples --no-default-features --features net --example replicon
+//! cargo run --release -p pliant_examples --no-default-features --features replicon --example replicon
 //! ```
 
 mod pair;
