@@ -348,7 +348,7 @@ fn held_reactions_stay_smooth_and_finite_at_every_extreme() {
 }
 
 #[test]
-fn the_state_carries_the_flow() {
+fn the_state_has_the_viscoelastic_part() {
     let model = Arc::new(rod(2e5, 8, 0.05, false));
     let relaxation = Some(Relaxation { ratio: 0.5, time: 0.2 });
     let config = BodyConfig::from(StepSettings { relaxation, ..Default::default() });

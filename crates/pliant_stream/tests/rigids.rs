@@ -205,7 +205,7 @@ struct Off {
 impl Off {
     fn look(&mut self, guest: &GuestSession, tick: u64) {
         for rigid in guest.rigids() {
-            let (shown, truth) = (rigid.shown(), ball(rigid.id().0, rigid.tick()));
+            let (shown, truth) = (rigid.visual(), ball(rigid.id().0, rigid.tick()));
             let off = distance(&shown, &truth);
             self.count += 1.0;
             self.squares += off * off;
@@ -277,8 +277,8 @@ fn what_rests_costs_nothing_and_is_where_it_rests() {
     for rigid in session.guest.rigids() {
         let truth = ball(rigid.id().0, 200.0);
         assert!(rigid.is_resting(), "{rigid:?}");
-        assert!(distance(&rigid.shown(), &truth) < 1e-4, "{rigid:?}");
-        assert!(angle(&rigid.shown(), &truth) < 1e-6, "{rigid:?}");
+        assert!(distance(&rigid.visual(), &truth) < 1e-4, "{rigid:?}");
+        assert!(angle(&rigid.visual(), &truth) < 1e-6, "{rigid:?}");
     }
     // Another guest joins.
     let mut late = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
@@ -296,7 +296,7 @@ fn what_rests_costs_nothing_and_is_where_it_rests() {
     let names: Vec<String> = late.rigids().map(|rigid| rigid.name().to_owned()).collect();
     assert_eq!(names, ["ball 0", "ball 1", "ball 2"]);
     for rigid in late.rigids() {
-        assert!(rigid.is_resting() && distance(&rigid.shown(), &ball(rigid.id().0, 200.0)) < 1e-4);
+        assert!(rigid.is_resting() && distance(&rigid.visual(), &ball(rigid.id().0, 200.0)) < 1e-4);
     }
     // One is pushed: it moves again, and is shown from where it lay.
     let pushed = |tick: u64| {
@@ -307,9 +307,9 @@ fn what_rests_costs_nothing_and_is_where_it_rests() {
         all
     };
     session.tick = session.tick.max(26 * 64);
-    let mut last = session.guest.rigid(RigidId(0)).unwrap().shown().position[2];
+    let mut last = session.guest.rigid(RigidId(0)).unwrap().visual().position[2];
     session.run(2.0, pushed, |guest, _| {
-        let z = guest.rigid(RigidId(0)).unwrap().shown().position[2];
+        let z = guest.rigid(RigidId(0)).unwrap().visual().position[2];
         assert!(z >= last - 1e-6 && z - last < 0.5 / 60.0 * 2.5, "from {last} to {z}");
         last = z;
     });
@@ -350,7 +350,7 @@ fn a_jump_is_shown_as_one() {
                 vec![(RigidId(5), state)]
             };
             let look = |guest: &GuestSession, _: u64| {
-                let x = guest.rigid(RigidId(5)).map_or(0.0, |rigid| rigid.shown().position[0]);
+                let x = guest.rigid(RigidId(5)).map_or(0.0, |rigid| rigid.visual().position[0]);
                 assert!(!(0.4..49.9).contains(&x), "{link:?} {speed} m/s: nothing is at {x}");
             };
             session.run(3.0, at, look);
@@ -359,7 +359,7 @@ fn a_jump_is_shown_as_one() {
             session.run(0.25, at, look);
             session.silent = false;
             session.run(2.75, at, look);
-            let x = session.guest.rigid(RigidId(5)).unwrap().shown().position[0];
+            let x = session.guest.rigid(RigidId(5)).unwrap().visual().position[0];
             assert!(x > 49.99 + 5.0 * speed, "{x}");
         }
     }
@@ -374,7 +374,7 @@ fn a_pause_of_the_host_is_a_pause_here() {
         let state = RigidState { position: [x, 0.0, 0.0], linear: [0.5, 0.0, 0.0], ..Default::default() };
         vec![(RigidId(0), state)]
     };
-    let x = |guest: &GuestSession| guest.rigid(RigidId(0)).unwrap().shown().position[0];
+    let x = |guest: &GuestSession| guest.rigid(RigidId(0)).unwrap().visual().position[0];
     let mut session = Session::on(Preset::Lan);
     session.add(1);
     session.run(4.0, states, |_, _| {});
@@ -425,7 +425,7 @@ fn what_has_rested_for_long_moves_again() {
         vec![(RigidId(0), state)]
     };
     session.run(2.0, moves, |_, _| {});
-    let x = session.guest.rigid(RigidId(0)).unwrap().shown().position[0];
+    let x = session.guest.rigid(RigidId(0)).unwrap().visual().position[0];
     assert!(x > 0.9, "{x}");
 }
 
@@ -446,7 +446,7 @@ fn what_comes_and_goes_is_shown_so() {
             let rigid = guest.rigid(RigidId(1)).unwrap();
             // What was shown wrong of its way here is corrected, and it does not go on.
             if rigid.tick() > gone as f64 + 2.0 {
-                let off = distance(&rigid.shown(), &ball(1, gone as f64));
+                let off = distance(&rigid.visual(), &ball(1, gone as f64));
                 assert!(off < before + 0.02, "it stands still, and is off by {off} after {before}");
                 before = off;
             }
@@ -454,14 +454,14 @@ fn what_comes_and_goes_is_shown_so() {
     );
     let left_out = session.guest.rigid(RigidId(1)).unwrap();
     assert!(left_out.is_resting(), "{left_out:?}");
-    assert!(distance(&left_out.shown(), &ball(1, gone as f64)) < 1e-4, "{left_out:?}");
+    assert!(distance(&left_out.visual(), &ball(1, gone as f64)) < 1e-4, "{left_out:?}");
 
     session.host.remove_rigid(RigidId(1));
     let far = RigidState { position: [9.0; 3], ..RigidState::default() };
     session.host.add_rigid(RigidId(1), "another", far).unwrap();
     session.run(2.0, |tick| balls(1, tick), |_, _| {});
     let another = session.guest.rigid(RigidId(1)).unwrap();
-    assert_eq!((another.name(), another.shown().position), ("another", [9.0; 3]));
+    assert_eq!((another.name(), another.visual().position), ("another", [9.0; 3]));
 
     let config = HostSessionConfig { guest_rate: 8000.0, ..HostSessionConfig::default() };
     let mut slow = Session::new(&LinkConfig::preset(Preset::Lan), Duration::from_millis(1), config);
@@ -471,7 +471,8 @@ fn what_comes_and_goes_is_shown_so() {
     slow.run(20.0, |tick| balls(40, tick), |_, _| {});
     let rate = 8.0 * (slow.bytes[0] - before) as f64 / 20.0;
     assert!((1.0..4200.0).contains(&rate), "{rate} bit/s");
-    let moved = slow.guest.rigids().filter(|rigid| distance(&rigid.shown(), &ball(rigid.id().0, 0.0)) > 1e-3);
+    let moved =
+        slow.guest.rigids().filter(|rigid| distance(&rigid.visual(), &ball(rigid.id().0, 0.0)) > 1e-3);
     assert!(moved.count() > 20);
 }
 
@@ -504,11 +505,11 @@ fn silence_ends_in_a_stand() {
         vec![(RigidId(0), state)]
     };
     session.run(4.0, states, |_, _| {});
-    let before = session.guest.rigid(RigidId(0)).unwrap().shown().position[0];
+    let before = session.guest.rigid(RigidId(0)).unwrap().visual().position[0];
     let mut last = before;
     session.silent = true;
     session.run(2.0, states, |guest, _| {
-        let x = guest.rigid(RigidId(0)).unwrap().shown().position[0];
+        let x = guest.rigid(RigidId(0)).unwrap().visual().position[0];
         assert!(x >= last - 1e-9 && x - last < 0.02, "from {last} to {x}");
         last = x;
     });
@@ -516,7 +517,7 @@ fn silence_ends_in_a_stand() {
     assert!(last - before < 0.5 * 0.3, "led on by {}", last - before);
     let mut step: f64 = 0.0;
     session.run(2.0, states, |guest, _| {
-        let x = guest.rigid(RigidId(0)).unwrap().shown().position[0];
+        let x = guest.rigid(RigidId(0)).unwrap().visual().position[0];
         step = step.max((x - last).abs());
         last = x;
     });
@@ -573,7 +574,7 @@ fn a_guest_survives_what_a_host_may_send() {
     for frame in 1..200 {
         session.guest.update(now + Duration::from_millis(16 * frame));
         for rigid in session.guest.rigids() {
-            let shown = rigid.shown();
+            let shown = rigid.visual();
             assert!(shown.position.iter().chain(&shown.rotation).all(|x| x.is_finite()), "{rigid:?}");
         }
     }

@@ -5,11 +5,11 @@ use bevy::{diagnostic::DiagnosticsStore, prelude::*};
 use super::{app, model, steps};
 use crate::{AWAKE_BODIES, BodyState, ModalAsset, ModalBody, STEP_TIME, VisualState};
 
-const CROWD: usize = 1_000;
+const BODIES: usize = 1_000;
 
 fn many_bodies(app: &mut App, bundle: impl Bundle + Clone) -> Vec<Entity> {
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model::bar()));
-    let bodies = (0..CROWD)
+    let bodies = (0..BODIES)
         .map(|_| app.world_mut().spawn((ModalBody::new(handle.clone()), bundle.clone())).id())
         .collect();
     app.update();
@@ -37,7 +37,7 @@ fn a_thousand_bodies_at_rest_are_neither_stepped_nor_shown_anew_and_one_that_is_
             .collect::<Vec<_>>()
     };
     let before = states(&mut app);
-    assert_eq!(before.len(), CROWD);
+    assert_eq!(before.len(), BODIES);
     let timed = measured(&app, &STEP_TIME).1;
     steps(&mut app, 20);
     assert_eq!(measured(&app, &AWAKE_BODIES).0, Some(0.0));

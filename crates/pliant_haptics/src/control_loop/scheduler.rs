@@ -251,10 +251,10 @@ mod tests {
 
     /// A hand that is held away from the center, and that a suspended machine finds further away.
     #[cfg(any(target_os = "linux", target_os = "android"))]
-    struct Held(std::sync::Arc<std::sync::Mutex<f64>>);
+    struct StillHand(std::sync::Arc<std::sync::Mutex<f64>>);
 
     #[cfg(any(target_os = "linux", target_os = "android"))]
-    impl crate::HapticDevice for Held {
+    impl crate::HapticDevice for StillHand {
         fn info(&self) -> crate::DeviceInfo {
             crate::VirtualConfig::touch().info()
         }
@@ -274,7 +274,7 @@ mod tests {
     fn a_machine_that_wakes_up_from_a_suspend_ramps() {
         use crate::{Cycle, Fault, LocalModel, LoopConfig};
         let hand = std::sync::Arc::new(std::sync::Mutex::new(0.005));
-        let mut cycle = Cycle::new(Held(hand.clone()), LoopConfig::default()).unwrap();
+        let mut cycle = Cycle::new(StillHand(hand.clone()), LoopConfig::default()).unwrap();
         let mut scheduler = RealScheduler::new(LoopClock::start(), 1000.0);
         let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
         model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];

@@ -41,7 +41,7 @@ const KEPT: usize = 400;
 /// beyond it, and the rounding of the frames.
 const MAX_SHARE: f64 = 1.2 + 1e-3;
 
-struct Held {
+struct HeldHand {
     id: GrabId,
     state: GrabState,
     hand: HandPlayout,
@@ -52,7 +52,7 @@ struct Apps {
     now: Duration,
     model: Arc<ModalModel>,
     body: Body,
-    held: BTreeMap<GrabKey, Held>,
+    held: BTreeMap<GrabKey, HeldHand>,
     /// The numbers of users by name, which the host's app stores.
     known: BTreeMap<String, UserId>,
     truth: VecDeque<(u64, Vec<f64>)>,
@@ -109,7 +109,7 @@ impl Apps {
         let id = self.body.grab(&patch, state.hold).ok()?;
         let target = self.reachable(state.target);
         self.body.set_target(id, target).ok()?;
-        self.held.insert(key, Held { id, state, hand: HandPlayout::new(target.into()) });
+        self.held.insert(key, HeldHand { id, state, hand: HandPlayout::new(target.into()) });
         Some(())
     }
 }
@@ -266,8 +266,8 @@ struct Star {
     processes: Processes,
     /// The guest of each process in the pair; none for the host.
     guest: Vec<Option<usize>>,
-    /// When a process that has lost its session tries again.
-    again: Vec<Option<Duration>>,
+    /// When a process that has lost its session reconnects.
+    reconnects: Vec<Option<Duration>>,
     /// By how much the path of a process's next attempt is slower, which it gives up at once.
     late: Vec<Option<Duration>>,
     host_was_down: bool,
@@ -335,7 +335,7 @@ pub(super) fn run(
         apps,
         processes: Processes::default(),
         guest: vec![None; count],
-        again: vec![Some(Duration::ZERO); count],
+        reconnects: vec![Some(Duration::ZERO); count],
         late: vec![None; count],
         host_was_down: false,
         compared: vec![0; count],
@@ -394,12 +394,12 @@ impl Star {
             (FaultKind::ClockJump, Some(guest)) => self.pair.jump_guest(guest, fault.lasts),
             (FaultKind::SecondConnection | FaultKind::Crash, Some(guest)) => {
                 self.pair.cut(guest);
-                self.again[fault.process] = Some(fault.at);
+                self.reconnects[fault.process] = Some(fault.at);
             }
             (FaultKind::LateReconnect, Some(guest)) => {
                 self.pair.cut(guest);
                 self.late[fault.process] = Some(fault.lasts);
-                self.again[fault.process] = Some(fault.at);
+                self.reconnects[fault.process] = Some(fault.at);
                 return;
             }
             // The host's own end is in `look`.
@@ -446,14 +446,14 @@ impl Star {
                         way.reconfigure(link.clone()).map_err(|e| e.to_string())?;
                     }
                 }
-                if end.session.is_closed() && self.again[process].is_none() {
+                if end.session.is_closed() && self.reconnects[process].is_none() {
                     let pause = Duration::from_millis(self.random.range(200, 600));
                     // Who was sent away for breaking the protocol stays away.
                     let stays_away = process == malicious && self.apps.attacker.now.is_some();
-                    self.again[process] = Some(if stays_away { END } else { now + pause });
+                    self.reconnects[process] = Some(if stays_away { END } else { now + pause });
                 }
             }
-            let due = self.again[process].is_some_and(|again| again <= now);
+            let due = self.reconnects[process].is_some_and(|at| at <= now);
             let runs = host == Stalled::default() && stalled == host;
             if due && runs && !partitioned && !self.processes.is_down(process, now) {
                 self.connect(process)?;
@@ -504,7 +504,7 @@ impl Star {
         self.apps.guests.push((process, None, Duration::MAX));
         let joined = self.pair.join_with(config, path, self.random.next(), cached);
         self.guest[process] = Some(joined.map_err(|e| format!("{} cannot join: {e}", name(process)))?);
-        self.again[process] = None;
+        self.reconnects[process] = None;
         Ok(())
     }
 
@@ -577,7 +577,7 @@ impl Star {
             self.apps.ensure(near, || format!("{name} shows tick {shown} of {tick}"));
             self.apps.ensure(held, || format!("{name} holds nothing, of {hands} hands"));
             self.apps.ensure(off <= AGREES, || format!("{name} is off by {:.2} %", 100.0 * off));
-            let rigid = session.rigid(CRATE).map(|rigid| (rigid.tick(), rigid.shown().position[0]));
+            let rigid = session.rigid(CRATE).map(|rigid| (rigid.tick(), rigid.visual().position[0]));
             let (at, shown) = rigid.unwrap_or((f64::NAN, f64::NAN));
             let near = (-(AHEAD as f64)..40.0).contains(&(tick as f64 - at));
             let off = (shown - crate_at(at).position[0]).abs();

@@ -21,7 +21,7 @@ const NEW: f64 = 1e-3;
 const CORRECTION: f64 = 1e-8;
 
 /// Number of Newton rounds that find a shape anew with more columns.
-const AGAIN: usize = 2;
+const REFINEMENTS: usize = 2;
 
 /// Shares of the displacements of hands at which shapes are found.
 const SHARES: [f64; 4] = [0.35, 0.7, 1.0, 1.25];
@@ -143,7 +143,7 @@ impl Columns {
             shapes = widened(&shapes, columns.width, new.width);
             columns = columns.with(&new);
             let points = columns.some_points(model, region);
-            shapes = columns.again(model, region, loads, law, &points, shapes)?;
+            shapes = columns.refined(model, region, loads, law, &points, shapes)?;
             if share.is_some_and(|share| share <= ENOUGH) {
                 break;
             }
@@ -152,7 +152,7 @@ impl Columns {
         let (columns, shapes) =
             columns.compressed(&columns.rows(region, loads), model.omega(), shapes, keep)?;
         let points = columns.some_points(model, region);
-        let shapes = columns.again(model, region, loads, law, &points, shapes)?;
+        let shapes = columns.refined(model, region, loads, law, &points, shapes)?;
         (!shapes.is_empty()).then_some((columns, shapes))
     }
 
@@ -209,7 +209,7 @@ impl Columns {
     }
 
     /// Finds shapes anew, from where they were.
-    fn again(
+    fn refined(
         &self,
         model: &ModalModel,
         region: &Region<'_>,
@@ -220,9 +220,10 @@ impl Columns {
     ) -> Option<Vec<GuidedShape>> {
         let (omega, patches) = (self.omega(model), self.rows(region, loads));
         let mut energy = coarse(model, law, &omega, points)?;
-        let again =
-            |shape: GuidedShape| cubature::hold(&mut energy, &omega, &patches, &shape.there, &shape.q, AGAIN);
-        Some(shapes.into_iter().filter_map(again).collect())
+        let refine = |shape: GuidedShape| {
+            cubature::hold(&mut energy, &omega, &patches, &shape.there, &shape.q, REFINEMENTS)
+        };
+        Some(shapes.into_iter().filter_map(refine).collect())
     }
 
     /// Makes columns that correct shapes: the displacements by which a Newton step changes them,

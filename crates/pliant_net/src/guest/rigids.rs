@@ -31,7 +31,7 @@ impl NetGuest {
             (None, None) => {
                 let mut transform = Transform::default();
                 let session = self.session.as_ref();
-                if let Some(shown) = session.and_then(|session| session.rigid(id)).map(|one| one.shown()) {
+                if let Some(shown) = session.and_then(|session| session.rigid(id)).map(|one| one.visual()) {
                     set_pose(&mut transform, &shown, &shown, 0.0, 1.0);
                 }
                 let shared = SharedRigid::named(name.clone());
@@ -87,7 +87,7 @@ pub(super) fn show_rigids(
     places: &mut ParamSet<(DisplayedBodies, TransformHelper, Query<&mut Transform>)>,
 ) {
     for (entity, id, child) in rigids {
-        let Some(shown) = session.rigid(id.0).map(|rigid| rigid.shown()) else { continue };
+        let Some(shown) = session.rigid(id.0).map(|rigid| rigid.visual()) else { continue };
         let parent = child.map(|child| places.p1().compute_global_transform(child.parent()));
         let mut all = places.p2();
         let Ok(mut transform) = all.get_mut(entity) else { continue };

@@ -153,7 +153,7 @@ struct FollowedBody {
 
 /// What the tasks of a broadcast share.
 #[derive(Clone)]
-struct Scene {
+struct FollowedScene {
     broadcast: broadcast::Consumer,
     to: Sender<WatchEvent>,
     models: Models,
@@ -234,13 +234,13 @@ async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sen
     let events = to.clone();
     let _connection = Owned::spawn(async move {
         // An app that does not read learns of the relay from what arrives.
-        let told = move |connection: Result<(), String>| {
+        let on_change = move |connection: Result<(), String>| {
             drop(events.try_send(WatchEvent::Relay(connection.is_ok())));
             if let Err(why) = connection {
                 drop(events.try_send(WatchEvent::RelayError(why)));
             }
         };
-        relay.keep(client, told).await;
+        relay.keep(client, on_change).await;
     });
     let models = Models::default();
     for model in known {
@@ -249,7 +249,7 @@ async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sen
     }
     let consumer = producer.consume();
     while let Ok(broadcast) = consumer.routed_broadcast(name.as_str()).await {
-        let scene = Scene { broadcast: broadcast.clone(), to: to.clone(), models: models.clone() };
+        let scene = FollowedScene { broadcast: broadcast.clone(), to: to.clone(), models: models.clone() };
         tokio::select! {
             _ = broadcast.closed() => {}
             () = scene.follow() => {}
@@ -260,7 +260,7 @@ async fn follow(relay: Relay, name: String, known: Vec<Arc<ModalModel>>, to: Sen
     }
 }
 
-impl Scene {
+impl FollowedScene {
     /// Follows the catalog, and with it the bodies, until the app is gone.
     async fn follow(&self) {
         let _hands = Owned::spawn(self.clone().follow_hands());

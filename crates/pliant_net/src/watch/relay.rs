@@ -133,20 +133,20 @@ pub(super) struct Relay {
 
 impl Relay {
     /// Address for logs.
-    pub(super) fn shown(&self) -> String {
+    pub(super) fn address(&self) -> String {
         without_token(self.url.as_str())
     }
 
-    /// Keeps a client connected, and calls `told` at each connection, and with the reason at each
+    /// Keeps a client connected, and calls `on_change` at each connection, and with the reason at each
     /// loss and failure.
-    pub(super) async fn keep(&self, client: moq_net::Client, told: impl Fn(Result<(), String>)) {
+    pub(super) async fn keep(&self, client: moq_net::Client, on_change: impl Fn(Result<(), String>)) {
         let mut pause = PAUSES[0];
         // Each reason once, and at most two in a row that alternate.
         let mut last = [String::new(), String::new()];
         loop {
             let why = match timeout(CONNECT, self.connect(&client)).await {
                 Ok(Ok((session, driver))) => {
-                    told(Ok(()));
+                    on_change(Ok(()));
                     let since = Instant::now();
                     let end = moq_net::time::run(driver).await;
                     drop(session);
@@ -155,10 +155,10 @@ impl Relay {
                         pause = PAUSES[0];
                         last = Default::default();
                     }
-                    format!("the relay {} is lost: {end}", self.shown())
+                    format!("the relay {} is lost: {end}", self.address())
                 }
-                Ok(Err(error)) => format!("the relay {} is not reached: {error}", self.shown()),
-                Err(_) => format!("the relay {} does not answer", self.shown()),
+                Ok(Err(error)) => format!("the relay {} is not reached: {error}", self.address()),
+                Err(_) => format!("the relay {} does not answer", self.address()),
             };
             let why = self.without_secrets(why);
             if last.contains(&why) {
@@ -168,7 +168,7 @@ impl Relay {
                 last.rotate_left(1);
                 last[1].clone_from(&why);
             }
-            told(Err(why));
+            on_change(Err(why));
             sleep(pause).await;
             pause = (pause * 2).min(PAUSES[1]);
         }

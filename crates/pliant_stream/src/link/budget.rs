@@ -125,6 +125,29 @@ impl PatchBudget {
     }
 }
 
+/// Budgets that all users of a session share, so that many cost no more than a few that stay.
+///
+/// Each user has a share of its own besides, so that the others cannot take what it needs. The
+/// share belongs to the connection and begins empty, so that nobody gains by coming anew.
+#[derive(Debug)]
+pub(crate) struct SharedBudgets {
+    pub(crate) patches: PatchBudget,
+    /// What costs most besides: impulses at a host, late inputs among peers.
+    pub(crate) work: Budget,
+}
+
+impl SharedBudgets {
+    /// What is for all.
+    pub(crate) fn of_all(work: Budget) -> Self {
+        Self { patches: PatchBudget::of_all(), work }
+    }
+
+    /// What is one user's own, from `now` on.
+    pub(crate) fn of_one(now: Duration, work: Budget) -> Self {
+        Self { patches: PatchBudget::of_one(now), work }
+    }
+}
+
 /// Pays from a user's own share, and where it is too small, from what is for all.
 pub(crate) fn pay(all: &mut Budget, share: &mut Budget, now: Duration, amount: f64) -> bool {
     share.spend(now, amount) || all.spend_or_owe(now, amount)

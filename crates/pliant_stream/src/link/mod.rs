@@ -9,7 +9,7 @@ mod tally;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-pub(crate) use budget::{AwayBudgets, Budget, PatchBudget, pay, state_budget};
+pub(crate) use budget::{AwayBudgets, Budget, PatchBudget, SharedBudgets, pay, state_budget};
 pub(crate) use events::Events;
 pub use stats::LinkStats;
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
-use crate::link::{Budget, Link, PatchBudget, state_budget};
+use crate::link::{Budget, Link, PatchBudget, SharedBudgets, state_budget};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{HeldAt, PeerBodyState};
 
@@ -63,27 +63,14 @@ impl PeerBudgets {
     }
 }
 
-/// Budgets that all peers share, so that many cost no more than a few.
-///
-/// Each peer has a share of its own besides, so that the others cannot take what it needs. The
-/// share belongs to the connection and begins empty, so that nobody gains by coming anew.
-#[derive(Debug)]
-pub(super) struct SharedBudgets {
-    patches: PatchBudget,
-    late: Budget,
+/// Late inputs of all peers: those of two that spend all they can.
+pub(super) fn late_of_all(step: f64) -> Budget {
+    Budget::new(2.0 * 192.0 / step, 512.0)
 }
 
-impl SharedBudgets {
-    /// What is for all peers: the late inputs of two that spend all they can.
-    pub(super) fn of_all(step: f64) -> Self {
-        Self { patches: PatchBudget::of_all(), late: Budget::new(2.0 * 192.0 / step, 512.0) }
-    }
-
-    /// What is one peer's own: an input with one hand two ticks later than all others, in each
-    /// tick.
-    fn of_one(now: Duration, step: f64) -> Self {
-        Self { patches: PatchBudget::of_one(now), late: Budget::empty(now, 4.0 / step, 64.0) }
-    }
+/// One peer's own of them: an input with one hand two ticks later than all others, in each tick.
+fn late_of_one(now: Duration, step: f64) -> Budget {
+    Budget::empty(now, 4.0 / step, 64.0)
 }
 
 #[derive(Debug)]
@@ -107,8 +94,8 @@ pub(super) struct RemotePeer {
     pub(super) theirs: Option<f64>,
     /// The newest tick that the other peer has sent.
     pub(super) newest: Tick,
-    /// When it has sent that.
-    pub(super) told_at: Duration,
+    /// When that arrived.
+    pub(super) newest_at: Duration,
     pub(super) requested: BTreeMap<Tick, Duration>,
     /// Number of consecutive checks that disagreed, per body.
     pub(super) mismatched: BTreeMap<BodyId, u32>,
@@ -144,7 +131,7 @@ impl RemotePeer {
             ahead: None,
             theirs: None,
             newest: 0,
-            told_at: Duration::ZERO,
+            newest_at: Duration::ZERO,
             requested: BTreeMap::new(),
             mismatched: BTreeMap::new(),
             lost: false,
@@ -152,7 +139,7 @@ impl RemotePeer {
             asked_state: false,
             partial: None,
             budgets: PeerBudgets::new(step),
-            share: SharedBudgets::of_one(now, step),
+            share: SharedBudgets::of_one(now, late_of_one(now, step)),
         }
     }
 
@@ -167,7 +154,7 @@ impl RemotePeer {
         [own, of_all]: [f64; 2],
     ) -> bool {
         self.budgets.late.spend(now, own)
-            && (self.share.late.spend(now, own) || all.late.spend_or_owe(now, own + of_all))
+            && (self.share.work.spend(now, own) || all.work.spend_or_owe(now, own + of_all))
     }
 
     /// Pays for a new patch, and returns whether the budgets allow it.
@@ -221,7 +208,7 @@ mod tests {
     #[test]
     fn many_peers_that_spend_all_they_can_stay_within_the_budget_of_all_and_leave_others_their_share() {
         let step = 0.025;
-        let mut all = SharedBudgets::of_all(step);
+        let mut all = SharedBudgets::of_all(late_of_all(step));
         let begun = Duration::from_secs(1);
         let peer = |k| RemotePeer::new(PeerId(k), begun, None, 1200, step);
         let mut peers: Vec<RemotePeer> = (0..60).map(peer).collect();

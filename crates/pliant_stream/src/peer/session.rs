@@ -21,8 +21,8 @@ use repair::affords;
 use super::body::PeerBody;
 use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
-use super::other::{Hello, PeerBudgets, RemotePeer, SharedBudgets};
-use crate::link::{AwayBudgets, Budget, Events};
+use super::other::{Hello, PeerBudgets, RemotePeer, late_of_all};
+use crate::link::{AwayBudgets, Budget, Events, SharedBudgets};
 use crate::session::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{
@@ -120,7 +120,7 @@ impl PeerSession {
             inputs.expect(config.user, 1);
         }
         Ok(Self {
-            shared: SharedBudgets::of_all(config.step),
+            shared: SharedBudgets::of_all(late_of_all(config.step)),
             config,
             others: BTreeMap::new(),
             addresses: BTreeMap::new(),
@@ -283,7 +283,7 @@ impl PeerSession {
             Datagram::Inputs(Inputs { now: theirs, ahead: seen, ticks, check }) => {
                 other.theirs = seen.or(other.theirs);
                 other.newest = theirs;
-                other.told_at = now;
+                other.newest_at = now;
                 other.came(now, theirs as f64 * self.config.step);
                 let sample = self.tick as f64 - theirs as f64;
                 if sample.abs() < WINDOW as f64 {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use pliant_modal::ModalModel;
 
 use super::host_peer::{GuestPeer, MAX_GUEST_GRABS};
-use crate::link::{Budget, PatchBudget, pay, state_budget};
+use crate::link::{Budget, PatchBudget, SharedBudgets, pay, state_budget};
 use crate::wire::MAX_BODIES;
 
 /// Largest number of impulses of one guest at once.
@@ -54,27 +54,15 @@ impl GuestBudgets {
     }
 }
 
-/// Budgets that all guests share, so that many new ones cost no more than a few that stay.
-///
-/// Each guest has a share of its own besides, so that the others cannot take what it needs. The
-/// share belongs to the connection and begins empty, so that nobody gains by coming anew.
-#[derive(Debug)]
-pub(crate) struct SharedBudgets {
-    patches: PatchBudget,
-    impulses: Budget,
+/// Impulses for all guests: those of sixty-four that spend all they can. Of 256 guests, each may at
+/// once make eight.
+pub(super) fn impulses_of_all() -> Budget {
+    Budget::new(3840.0, 2048.0)
 }
 
-impl SharedBudgets {
-    /// What is for all guests: the impulses of sixty-four that spend all they can. Of 256 guests,
-    /// each may at once make eight.
-    pub(super) fn of_all() -> Self {
-        Self { patches: PatchBudget::of_all(), impulses: Budget::new(3840.0, 2048.0) }
-    }
-
-    /// What is one guest's own: for 256 guests, as much again as is for all.
-    pub(super) fn of_one(now: Duration) -> Self {
-        Self { patches: PatchBudget::of_one(now), impulses: Budget::empty(now, 15.0, 30.0) }
-    }
+/// One guest's own of them: for 256 guests, as much again as is for all.
+pub(super) fn impulses_of_one(now: Duration) -> Budget {
+    Budget::empty(now, 15.0, 30.0)
 }
 
 impl GuestPeer {
@@ -94,6 +82,6 @@ impl GuestPeer {
 
     /// Pays for an impulse, and returns whether the budgets allow it.
     pub(super) fn pays_for_impulse(&mut self, all: &mut SharedBudgets, now: Duration) -> bool {
-        self.budgets.impulses.spend(now, 1.0) && pay(&mut all.impulses, &mut self.share.impulses, now, 1.0)
+        self.budgets.impulses.spend(now, 1.0) && pay(&mut all.work, &mut self.share.work, now, 1.0)
     }
 }

@@ -44,7 +44,7 @@ pub struct StreamedRigid {
     samples: VecDeque<Sample>,
     /// The tick that is shown, and what is shown.
     at: f64,
-    shown: RigidState,
+    visual: RigidState,
     /// What is shown beside what the samples say, until the correction is over.
     offset: [Vector3<f64>; 2],
 }
@@ -53,7 +53,7 @@ impl StreamedRigid {
     fn new(id: RigidId, name: &str, tick: Tick, state: RigidState) -> Self {
         let samples = VecDeque::from([Sample { tick, state, resting: false }]);
         let offset = [Vector3::zeros(); 2];
-        Self { id, name: name.to_owned(), samples, at: f64::MIN, shown: state, offset }
+        Self { id, name: name.to_owned(), samples, at: f64::MIN, visual: state, offset }
     }
 
     /// Number of the rigid body in the session.
@@ -70,8 +70,8 @@ impl StreamedRigid {
     /// axes of the host's world. It is continuous, but where the host's jumps.
     ///
     /// [`GuestSession::update`]: super::GuestSession::update
-    pub fn shown(&self) -> RigidState {
-        self.shown
+    pub fn visual(&self) -> RigidState {
+        self.visual
     }
 
     /// The tick that is shown, with its fraction.
@@ -114,7 +114,7 @@ impl StreamedRigid {
         let jumps = (since..next).any(jumped);
         let Some(a) = next.checked_sub(1).and_then(|k| self.samples.get(k)) else {
             // Nothing is known of before.
-            return (self.samples.front().map_or(self.shown, |s| s.state), jumps);
+            return (self.samples.front().map_or(self.visual, |s| s.state), jumps);
         };
         let state = match self.samples.get(next) {
             Some(b) => between(a, b, tick, h),
@@ -134,7 +134,7 @@ impl StreamedRigid {
             // schedule goes back, as after a pause of the host, the picture goes on from there.
             let (was, _) = self.state_at(before.min(tick), before, h);
             let left = (-(tick - before).max(0.0) * h / FADE).exp();
-            self.offset = difference(&self.shown, &was).map(|off| off * left);
+            self.offset = difference(&self.visual, &was).map(|off| off * left);
             let [way, turn] = self.offset.map(|off| off.norm());
             let speed = Vector3::from(was.linear).norm();
             if way.max(turn) < 1e-6 || way > SNAP + speed {
@@ -142,9 +142,9 @@ impl StreamedRigid {
             }
         }
         self.at = tick;
-        let shown = moved(&now, self.offset);
-        if shown.is_valid() {
-            self.shown = shown;
+        let visual = moved(&now, self.offset);
+        if visual.is_valid() {
+            self.visual = visual;
         }
         // One state before the picture is needed, and for corrections of it no more.
         while self.samples.get(1).is_some_and(|s| s.tick as f64 <= tick) {

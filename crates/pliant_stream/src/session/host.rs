@@ -8,14 +8,14 @@ use std::time::Duration;
 
 use pliant_modal::{ModalModel, StepSettings};
 
-use super::budgets::{GuestBudgets, SharedBudgets};
+use super::budgets::{GuestBudgets, impulses_of_all};
 use super::host_config::{HostEvent, HostSessionConfig};
 use super::host_peer::{GuestPeer, Standing};
 use super::host_rigids::HostRigids;
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::codec::encoder::Encoder;
-use crate::link::{AwayBudgets, Events};
+use crate::link::{AwayBudgets, Events, SharedBudgets};
 use crate::newmark::Newmark;
 use crate::state::{
     BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo, next_free,
@@ -144,7 +144,7 @@ impl HostSession {
             upload,
             encoded: 0,
             encoders_made: 0,
-            shared: SharedBudgets::of_all(),
+            shared: SharedBudgets::of_all(impulses_of_all()),
             work: 0,
             away: AwayBudgets::default(),
             gone: LinkStats::default(),

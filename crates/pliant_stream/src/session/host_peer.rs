@@ -4,12 +4,12 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::budgets::{GuestBudgets, SharedBudgets};
+use super::budgets::{GuestBudgets, impulses_of_one};
 use super::host_config::HostSessionConfig;
 use super::host_rigids::rigid_budget;
 use super::regulator::Regulator;
 use super::{DisconnectReason, Output};
-use crate::link::{Budget, Link, micros};
+use crate::link::{Budget, Link, SharedBudgets, micros};
 use crate::state::{BodyId, PeerId, RigidId, Role, Tick, UserId, UserInfo};
 use crate::wire::{Clock, Datagram, HostMessage, StreamSubscription};
 
@@ -103,7 +103,7 @@ impl GuestPeer {
             ping: None,
             unsent: 0,
             budgets: GuestBudgets::new(config.model_rate),
-            share: SharedBudgets::of_one(now),
+            share: SharedBudgets::of_one(now, impulses_of_one(now)),
             regulator: Regulator::default(),
         }
     }

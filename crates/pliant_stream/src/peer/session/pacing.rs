@@ -8,20 +8,20 @@ use super::PeerSession;
 const SLEW: f64 = 0.01;
 /// Number of ticks behind most others from which on a peer catches up by steps of its own.
 pub(super) const BEHIND: u64 = 8;
-/// Time for which the tick of a peer counts that is not heard of: at least this long, and at least
-/// so many steps.
-const HEARD: Duration = Duration::from_millis(250);
-const HEARD_STEPS: f64 = 4.0;
+/// A peer counts for so long after its last tick arrived: at least this long, and at least so many
+/// steps.
+const PRESENT: Duration = Duration::from_millis(250);
+const PRESENT_STEPS: f64 = 4.0;
 
 impl PeerSession {
     /// By how many ticks most other peers are at least ahead of this one, and by how many behind,
     /// judged by the newest tick received from each of late. Some may have stalled together. Where
-    /// less than half are heard of, nobody is.
+    /// less than half have sent one of late, both are zero.
     pub(super) fn lead(&self) -> (u64, u64) {
         let known = || self.others.values().filter(|o| o.user.is_some() && o.newest > 0);
-        let patience = HEARD.max(Duration::from_secs_f64(HEARD_STEPS * self.config.step));
-        let heard = known().filter(|o| self.updated.saturating_sub(o.told_at) <= patience);
-        let mut newest: Vec<u64> = heard.map(|o| o.newest).collect();
+        let patience = PRESENT.max(Duration::from_secs_f64(PRESENT_STEPS * self.config.step));
+        let present = known().filter(|o| self.updated.saturating_sub(o.newest_at) <= patience);
+        let mut newest: Vec<u64> = present.map(|o| o.newest).collect();
         if 2 * newest.len() < known().count() {
             return (0, 0);
         }

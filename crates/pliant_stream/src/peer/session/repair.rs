@@ -200,7 +200,7 @@ mod tests {
             log.expect(user, 1);
             assert!(log.put(user, input(1)));
         }
-        let mut all = SharedBudgets::of_all(step);
+        let mut all = SharedBudgets::of_all(crate::peer::other::late_of_all(step));
         let mut peers: Vec<RemotePeer> =
             (0..24).map(|k| RemotePeer::new(PeerId(k), begun, None, 1200, step)).collect();
         let mut steps = 0;
