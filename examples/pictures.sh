@@ -7,7 +7,8 @@
 # Each is made by the example itself (--screenshot), at 1280x720, and has at most 300,000 bytes: a
 # larger one gets a palette where Python's Pillow or ImageMagick is there, and is taken smaller if
 # that is not enough. OUT is another folder for them, BIN one with the examples' binaries, PROFILE
-# one of cargo's.
+# one of cargo's. What the recording's picture and Blender's need besides is told where it is
+# missing, and these pictures stay as they are.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -131,6 +132,33 @@ if is_wanted blender; then
     if [ -s "$work/blender.png" ]; then
         if [ "$(stat -c %s "$work/blender.png")" -gt $most ]; then smaller "$work/blender.png"; fi
         mv "$work/blender.png" "$out/blender.png"
+    fi
+fi
+
+# A recording in its viewer, short enough to be read before the picture is taken; on a busy machine
+# plots may be empty all the same, and it is made again. The window is at the corner of a larger
+# screen, so that the pointer, which is at its center, is not over it. The viewer that draws in
+# software may end with an error after it has written the picture, which has two pixels for each of
+# the window's.
+if is_wanted recording; then
+    if command -v rerun >/dev/null && python3 -c 'import PIL' 2>/dev/null; then
+        (cd "$work" && "$BIN/shared_body" --headless --seconds 20 --rerun out.rrd) \
+            >"$work/recording.log" 2>&1 || { cat "$work/recording.log" >&2; exit 1; }
+        (cd "$work" && HOME="$work" timeout 600 xvfb-run -a -s "-screen 0 5400x3000x24" \
+            rerun out.rrd --bind 127.0.0.1 --port 0 --screenshot-to recording.png \
+            --window-size 1280x720) >"$work/viewer.log" 2>&1 || true
+        [ -s "$work/recording.png" ] || { cat "$work/viewer.log" >&2; exit 1; }
+        python3 - "$work/recording.png" <<'PYTHON'
+import sys
+from PIL import Image
+Image.open(sys.argv[1]).convert("RGB").resize((1280, 720), Image.LANCZOS).save(sys.argv[1], optimize=True)
+PYTHON
+        if [ "$(stat -c %s "$work/recording.png")" -gt $most ]; then smaller "$work/recording.png"; fi
+        mv "$work/recording.png" "$out/recording.png"
+        printf '%-24s %7d bytes, %d s\n' recording.png "$(stat -c %s "$out/recording.png")" "$SECONDS"
+    else
+        echo "recording.png stays: there is no viewer or no Pillow" \
+            "(pip install rerun-sdk==0.36.3 pillow)" >&2
     fi
 fi
 
