@@ -8,9 +8,12 @@ work. Writes leave-out.md and leave-out.csv. Most compile the engine with anothe
 ours is compiled once, with the features that the whole project asks of it, and the programs of scenes with a window are up to that much larger than they need be.
 """
 
-import argparse, csv, datetime, json, os, pathlib, platform, shutil, subprocess, sys, tempfile
+import argparse, csv, json, os, pathlib, shutil, subprocess, sys, tempfile
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "benches"))
+import stamp
+
 SCENES = {
     "engine": ("the engine alone, with a camera", ["window"]),
     "bare": ("the engine alone, no picture", []),
@@ -72,7 +75,7 @@ def main():
     parser.add_argument("--programs", type=pathlib.Path, help="a folder with programs built before, each named by its features joined with '-', or none")
     parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "docs/report")
     args = parser.parse_args()
-    rows, load, kept = [], [os.getloadavg()[0]], tempfile.TemporaryDirectory()
+    rows, load, kept = [], [stamp.load()], tempfile.TemporaryDirectory()
     programs = {}
     for scene, (_, features) in SCENES.items():
         if args.only and scene not in args.only:
@@ -86,7 +89,7 @@ def main():
             # The next scene's program has the same name.
             programs[tuple(features)] = shutil.copy(build(features, args.one_engine, target), pathlib.Path(kept.name) / called(features))
     # Compiled first, measured then: nothing else of ours runs meanwhile.
-    load.append(os.getloadavg()[0])
+    load.append(stamp.load())
     for scene, (what, features) in SCENES.items():
         if tuple(features) not in programs:
             continue
@@ -97,7 +100,7 @@ def main():
         for phase in ("rest", "work"):
             row |= {f"{phase}_{name}": value for name, value in told[phase].items()}
         rows.append(row)
-    load.append(os.getloadavg()[0])
+    load.append(stamp.load())
     if not rows:
         sys.exit("nothing was measured")
 
@@ -106,9 +109,10 @@ def main():
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
+    version = stamp.locked("pliant")
     lines = ["# What a scene leaves out", "",
-             f"{datetime.date.today()}, {os.cpu_count()} cores, {platform.machine()}; load of the machine {load[1]:.1f} when measuring began, {load[2]:.1f} at its end. Remade by "
-             f"`python3 benches/leave_out/run.py{' --one-engine' if args.one_engine else ''}`.", "",
+             f"{stamp.machine()}; Pliant {version}{stamp.commit()}, Bevy {stamp.locked('bevy')}. Load of the machine {load[1]:.1f} when measuring began, {load[2]:.1f} at its end; "
+             f"{load[0]:.1f} before the builds. Remade by `python3 benches/leave_out/run.py{' --one-engine' if args.one_engine else ''}`.", "",
              "| scene | features | crates | program, MB | systems of ours (of the engine) | a frame at rest, ms (99 %) | at work, ms (99 %) | the steps of a tick at work, ms | processor a frame, rest / work, ms | bodies stepped, rest / work |",
              "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"]
     for r in rows:
