@@ -1,6 +1,6 @@
 """What the scripts beside share: one thread each, the program, and rounds by turns."""
 
-import json, os, pathlib, subprocess, sys
+import json, multiprocessing, os, pathlib, signal, subprocess, sys
 
 # Before numpy is imported.
 for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS"):
@@ -17,8 +17,14 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benches"))
 # Rounds of each, ours and the other's by turns.
 ROUNDS = 5
+# A row that takes longer ends, and the table says so, s.
+LIMIT = 600
 # Frequencies of ours and of SciPy's may differ by this, relative.
 SAME_FREQUENCY = 1e-6
+
+
+class TooLong(RuntimeError):
+    """A row's time is over."""
 
 
 class Pliant:
@@ -54,6 +60,40 @@ def same_frequencies(ours, theirs):
     if not off <= SAME_FREQUENCY:
         raise RuntimeError(f"frequencies differ by {off:.1e} relative")
     return off
+
+
+def within(seconds, work, folder):
+    """What `work` returns, in a process of its own that ends when the time is over."""
+    ours, its = multiprocessing.Pipe(False)
+
+    def run():
+        # Its own programs end with it. MuJoCo writes its log where it runs.
+        os.setsid()
+        os.chdir(folder)
+        try:
+            its.send((True, work()))
+        except Exception as error:
+            its.send((False, (str(error) or type(error).__name__).splitlines()[0]))
+
+    child = multiprocessing.get_context("fork").Process(target=run)
+    child.start()
+    its.close()
+    try:
+        if not ours.poll(seconds):
+            raise TooLong(f"not at its end after {seconds} s")
+        done, told = ours.recv()
+    except EOFError:
+        child.join()
+        raise RuntimeError(f"the program ended with {child.exitcode}") from None
+    finally:
+        try:
+            os.killpg(child.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            child.kill()
+        child.join()
+    if not done:
+        raise RuntimeError(told)
+    return told
 
 
 def ratios(rounds):

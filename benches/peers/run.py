@@ -10,7 +10,7 @@ X.md it writes X.svg, X-error.csv and X-times.csv.
 
 import argparse, csv, pathlib, sys, tempfile
 
-from common import ROUNDS, Pliant, figure, span
+from common import LIMIT, ROUNDS, Pliant, figure, span
 
 import hang
 import stamp
@@ -44,6 +44,41 @@ def summary(rows):
     return lines
 
 
+def page(errors, speeds, name, rounds, made, load, versions):
+    """Lines of Markdown."""
+    along, down = hang.elastica()
+    return [
+        "# Pliant beside other programs", "",
+        f"![Error against run time, of all programs]({name}.svg)", "",
+        " ".join(summary(errors)), "",
+        "## Errors", "",
+        f"A bar of {hang.LENGTH:g} m x {hang.SIDE:g} m x {hang.SIDE:g} m hangs from a wall. The reference is the heavy elastica, which none of the programs is. The last column is the "
+        f"time for a second of motion over that of {hang.BESIDE[0]}, {hang.BESIDE[1]} of ten nodes, in {rounds} by turns with it.", "",
+        *hang.table(errors), "",
+        "## Times", "",
+        f"The same work on a free bar of {times.SIZE[0]:g} m x {times.SIZE[1]:g} m x {times.SIZE[2]:g} m and 1,080 tetrahedra of four nodes, with {times.MODES} linear modes of Pliant's, in {rounds} by "
+        "turns. *Its time* and *ours* are medians of the rounds, and the ratios are of each round.", "",
+        *times.table(speeds), "",
+        "## How it was measured", "",
+        f"- Made on {made}. Load of the machine at the start, between the tables and at the end: {', '.join(f'{x:.1f}' for x in load)}. One thread for each program.",
+        f"- Versions: {versions}.",
+        f"- Remade by `python3 benches/peers/run.py -o docs/report/peers.md`. The plot's figures are in [{name}-error.csv]({name}-error.csv), those of the second table in "
+        f"[{name}-times.csv]({name}-times.csv).",
+        f"- The hanging bar has E {hang.YOUNG:g} Pa, nu {hang.POISSON:g} and {hang.DENSITY:g} kg/m^3 under {hang.GRAVITY:g} m/s^2. By the elastica its end is {-down:.4f} m lower and {-along:.4f} m nearer "
+        f"to the wall. The free bar has E {times.YOUNG:g} Pa, nu {times.POISSON:g} and {times.DENSITY:g} kg/m^3.",
+        f"- All programs have the same grids. MuJoCo cuts the cells of a grid into tetrahedra in its own way. A row that takes more than {LIMIT} s is ended, and the table says so.",
+        "- Steps of the hanging bar: Pliant's are 1/60 s, with a hand and without writing the surface. MuJoCo's are the longest of 1/120 s and its halves at which it is stable, with its integrator "
+        "`discrete`. PyBullet's are 1/1000 s, and Rapier's and Exudyn's 1/240 s, as chosen here. Positions of all nodes are part of the times of MuJoCo, PyBullet and Rapier, and so are their collision "
+        "worlds without contacts. MuJoCo warns at every step that its matrix is nearly singular, and comes to rest all the same.",
+        "- Pliant's models are baked before, and Exudyn's modes are made before; that time is in neither table. Each model of Pliant's was asked whether it has the elasticity, the element and the "
+        "number of modes of its row.",
+        "- Exudyn's floating frame is fixed at the wall and has modes of Pliant's matrices. Its bending in the frame is linear, so it cannot follow a bar that bends this far: finer meshes bring it nearer to "
+        "the linear beam, not to the elastica.",
+        "- PyBullet's reduced deformable is in the second table only: as a file describes it, it is a free body.",
+        "- SOFA was not measured: its Python bindings (SofaPython3) are not on PyPI (tried on 2026-11-27), where `sofa` is the name of another program.",
+    ]
+
+
 def save(rows, path):
     with path.open("w", newline="") as file:
         table = csv.DictWriter(file, list(rows[0]))
@@ -57,8 +92,7 @@ def main():
     parser.add_argument("--pliant", help="the program; default: cargo run --release")
     parser.add_argument("-o", "--output", type=pathlib.Path, help="write the page to this file, and its plot and tables beside it")
     args = parser.parse_args()
-    pliant, load = Pliant(args.pliant), [stamp.load()]
-    made = f"{stamp.machine()}"
+    pliant, load, made = Pliant(args.pliant), [stamp.load()], stamp.machine()
     versions = ", ".join([f"Pliant {pliant.version()}{stamp.commit()}", *(f"{package} {stamp.installed(package)}" for package in PACKAGES)])
     with tempfile.TemporaryDirectory() as folder:
         errors = hang.measure(pliant, pathlib.Path(folder), args.quick)
@@ -66,39 +100,8 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         speeds = times.measure(pliant, pathlib.Path(folder), args.quick)
     load.append(stamp.load())
-    along, down = hang.elastica()
-    rounds = f"{ROUNDS} rounds" if not args.quick else "one round"
     name = args.output.stem if args.output else "peers"
-    lines = [
-        "# Pliant beside other programs", "",
-        f"![Error against run time, of all programs]({name}.svg)", "",
-        " ".join(summary(errors)), "",
-        "## Errors", "",
-        f"A bar of {hang.LENGTH:g} m x {hang.SIDE:g} m x {hang.SIDE:g} m hangs from a wall. The reference is the heavy elastica, which none of the programs is. *Times the row beside*: the "
-        f"time for a second of motion over that of {hang.BESIDE[0]}, {hang.BESIDE[1]}, in {rounds} by turns.", "",
-        *hang.table(errors), "",
-        "## Times", "",
-        f"The same work on a free bar of {times.SIZE[0]:g} m x {times.SIZE[1]:g} m x {times.SIZE[2]:g} m and 1,080 tetrahedra of four nodes, with {times.MODES} linear modes of Pliant's, in {rounds} by "
-        "turns. *Its time* and *ours* are medians of the rounds, and the ratios are of each round.", "",
-        *times.table(speeds), "",
-        "## How it was measured", "",
-        f"- Made on {made}. Load of the machine at the start, between the tables and at the end: {', '.join(f'{x:.1f}' for x in load)}. One thread for each program.",
-        f"- Versions: {versions}.",
-        f"- Remade by `python3 benches/peers/run.py -o docs/report/peers.md`. The plot's figures are in [{name}-error.csv]({name}-error.csv), those of the second table in "
-        f"[{name}-times.csv]({name}-times.csv).",
-        f"- The hanging bar has E {hang.YOUNG:g} Pa, nu {hang.POISSON:g} and {hang.DENSITY:g} kg/m^3 under {hang.GRAVITY:g} m/s^2. By the elastica its end is {-down:.4f} m lower and {-along:.4f} m nearer "
-        f"to the wall. The free bar has E {times.YOUNG:g} Pa, nu {times.POISSON:g} and {times.DENSITY:g} kg/m^3.",
-        f"- All programs have the same grids. MuJoCo cuts the cells of a grid into tetrahedra in its own way. A row that takes more than {hang.LIMIT} s is ended, and the table says so.",
-        "- Steps of the hanging bar: Pliant's are 1/60 s, with a hand and without writing the surface. MuJoCo's are the longest of 1/120 s and its halves at which it is stable, with its integrator "
-        "`discrete`. PyBullet's are 1/1000 s, and Rapier's and Exudyn's 1/240 s, as chosen here. Positions of all nodes are part of the times of MuJoCo, PyBullet and Rapier, and so are their collision "
-        "worlds without contacts.",
-        "- Pliant's models are baked before, and Exudyn's modes are made before; that time is in neither table. Each model of Pliant's was asked whether it has the elasticity, the element and the "
-        "number of modes of its row.",
-        "- Exudyn's floating frame is fixed at the wall and has modes of Pliant's matrices. Its bending in the frame is linear, so it cannot follow a bar that bends this far: finer meshes bring it nearer to "
-        "the linear beam, not to the elastica.",
-        "- PyBullet's reduced deformable is in the second table only: as a file describes it, it is a free body.",
-        "- SOFA was not measured: its Python bindings (SofaPython3) are not on PyPI (tried on 2026-11-27), where `sofa` is the name of another program.",
-    ]
+    lines = page(errors, speeds, name, "one round" if args.quick else f"{ROUNDS} rounds", made, load, versions)
     print("\n".join(lines))
     if args.output:
         args.output.write_text("\n".join(lines) + "\n")
