@@ -310,5 +310,5 @@ def table(rows):
             cells += [f"{figure(r['its'])} {r['unit']}", f"{figure(r['ours'])} {r['unit']}", told("ratio"), "" if r["second_median"] is None else told("second")]
         lines.append(f"| {' | '.join([*cells, r['computes']])} |")
     faster = [f"{r['program']} ({r['job']})" for r in rows if r["its"] is not None and r["ratio_median"] < 1.0]
-    missing = [r["program"] for r in rows if r["its"] is None]
+    missing = [f"{r['program']} ({r['job']})" for r in rows if r["its"] is None]
     return [*lines, "", f"Faster than Pliant in this run: {', '.join(faster) or 'none'}. Not measured: {', '.join(missing) or 'none'}."]
