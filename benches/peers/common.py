@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT / "benches"))
 # Rounds of each, ours and the other's by turns.
 ROUNDS = 5
 # A row that takes longer ends, and the table says so, s.
-LIMIT = 600
+LIMIT = 300
 # Frequencies of ours and of SciPy's may differ by this, relative.
 SAME_FREQUENCY = 1e-6
 
