@@ -77,7 +77,7 @@ fn table(report: &StabilityReport) -> String {
             );
         }
         if let Some(plain) = &case.plain {
-            let _ = writeln!(text, "                     the paper's plain scheme: {plain}");
+            let _ = writeln!(text, "                     {}: {plain}", case.papers_way());
         }
     }
     let passed = report.cases.iter().filter(|c| c.passed).count();

@@ -280,58 +280,8 @@ const HEADING: &str = "# Cost and accuracy of Pliant\n\nEach part says by which 
 
 /// A line that says how a part was made.
 fn stamp(part: Part, quick: bool, seconds: f64, load: Option<f64>) -> String {
-    let days = std::time::SystemTime::now()
-        .duration_since(std::time::UNIX_EPOCH)
-        .map_or(0, |since| since.as_secs() / 86_400);
-    let [y, m, d] = date(days as i64);
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let load = match (load, machine::load()) {
-        (Some(before), Some(after)) => format!(" Load {before:.1} at the start and {after:.1} at the end."),
-        _ => String::new(),
-    };
-    format!(
-        "*Made on {y:04}-{m:02}-{d:02} in {seconds:.0} s by `pliant report --only {}{}`: Pliant {}, {cores} cores{}, {} {}, {}. What is random has the seed {}.{load}{}*",
-        part.name(),
-        if quick { " --quick" } else { "" },
-        env!("CARGO_PKG_VERSION"),
-        match machine::processor() {
-            name if name.is_empty() => name,
-            name => format!(" of {name}"),
-        },
-        std::env::consts::ARCH,
-        std::env::consts::OS,
-        vectors(),
-        Experiment::SEED,
-        if cfg!(debug_assertions) { " A build that checks itself, so that times are too long." } else { "" },
-    )
-}
-
-/// The widest vector instructions of this CPU that the reconstruction supports.
-fn vectors() -> &'static str {
-    #[cfg(target_arch = "x86_64")]
-    {
-        if std::arch::is_x86_feature_detected!("avx512f") {
-            return "AVX-512";
-        }
-        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
-            return "AVX2";
-        }
-    }
-    "portable vectors"
-}
-
-/// Year, month and day (UTC) of a number of days since 1970-01-01 in the Gregorian calendar.
-fn date(days: i64) -> [i64; 3] {
-    // H. Hinnant, "chrono-compatible low-level date algorithms": eras of 400 years that begin in
-    // March.
-    let z = days + 719_468;
-    let era = z.div_euclid(146_097);
-    let day = z.rem_euclid(146_097);
-    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
-    let of_year = day - (365 * year + year / 4 - year / 100);
-    let shifted = (5 * of_year + 2) / 153;
-    let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
-    [year + era * 400 + i64::from(month <= 2), month, of_year - (153 * shifted + 2) / 5 + 1]
+    let command = format!("pliant report --only {}{}", part.name(), if quick { " --quick" } else { "" });
+    machine::made(&command, seconds, &format!("What is random has the seed {}", Experiment::SEED), load)
 }
 
 #[cfg(test)]
@@ -354,12 +304,5 @@ mod tests {
         );
         let found: Vec<_> = Section::all(&page).into_iter().map(|s| (s.part, s.text)).collect();
         assert_eq!(found, [(second, "one\n\n### not a part".to_owned()), (first, "three".to_owned())]);
-    }
-
-    #[test]
-    fn dates_are_those_of_the_calendar() {
-        assert_eq!(super::date(0), [1970, 1, 1]);
-        assert_eq!(super::date(11_016), [2000, 2, 29]);
-        assert_eq!(super::date(20_819), [2027, 1, 1]);
     }
 }

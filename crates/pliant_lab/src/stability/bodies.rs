@@ -29,6 +29,8 @@ pub(super) struct BarBody {
     pub(super) zeta: f64,
     /// Held at x = 0 if true, free otherwise.
     pub(super) held: bool,
+    /// Sites at which flexibilities are baked. `None`: as the bake has it.
+    pub(super) sites: Option<usize>,
     /// Material for large strains. The modes are then coordinates.
     pub(super) material: Option<Material>,
 }
@@ -46,6 +48,7 @@ impl Default for BarBody {
             density: 1000.0,
             zeta: 0.03,
             held: true,
+            sites: Some(48),
             material: None,
         }
     }
@@ -79,7 +82,7 @@ impl BarBody {
             density: self.density,
             damping: Damping::Ratio(self.zeta),
             anchors,
-            sites: Some(48),
+            sites: self.sites,
             ..BakeConfig::default()
         };
         Ok(Arc::new(bake(mesh, None, &config, &mut |_, _| ())?.model))
@@ -203,17 +206,27 @@ pub(super) fn energy_growth(body: &mut Body, steps: usize) -> Result<[f64; 2], S
     Ok([growth, last / start])
 }
 
+/// What rounding may add in a step, as a share: a hundred times the spacing of numbers near 1.
+pub(super) const ROUNDING: f64 = 100.0 * f64::EPSILON;
+
+/// Energy that may be left after [`settling`], as a share: the amplitude of the slowest mode has
+/// then decayed by `e^-12`, and its energy by `e^-24`, 4e-11.
+pub(super) const RESTED: f64 = 1e-10;
+
+/// Force that may still come and go after [`settling`], as a share: `e^-12` is 6e-6.
+pub(super) const STILL: f64 = 1e-5;
+
 /// The bound on [`energy_growth`], which leaves room for rounding only. Generalized-alpha conserves
 /// another norm, which equals the energy within a factor.
 pub(super) fn no_growth(growth: f64) -> Bound {
-    Bound::new("largest growth of the energy in a step / energy", growth, 1e-9)
+    Bound::new("largest growth of the energy in a step / energy", growth, ROUNDING)
 }
 
 /// The bound on a largest energy as a multiple of the first one, which leaves room for rounding
 /// only.
 pub(super) fn gain(what: &'static str, multiple: f64) -> Bound {
     // A number that is not finite stays so.
-    Bound::new(what, if multiple.is_finite() { (multiple - 1.0).max(0.0) } else { multiple }, 1e-9)
+    Bound::new(what, if multiple.is_finite() { (multiple - 1.0).max(0.0) } else { multiple }, ROUNDING)
 }
 
 /// The largest of some numbers, or no number if one of them is none.

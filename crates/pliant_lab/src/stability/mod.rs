@@ -3,7 +3,8 @@
 //! A bound compares a measured number with a limit. The margin of a case is `limit / measured` of
 //! its tightest bound, at most 1e12: with 1 the bound just holds, with 10 it holds ten times over.
 //! In cases with hands, the paper's plain scheme (average acceleration, hands as rigid position
-//! constraints) runs the same script, and its result stands beside.
+//! constraints) runs the same script, and its result stands beside. Over networks it is the paper's
+//! repair, and none, with the paper's integrator at both ends.
 
 mod bodies;
 mod contact;
@@ -17,6 +18,7 @@ mod network;
 mod page;
 mod plain;
 mod reduced;
+mod solid;
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -29,7 +31,7 @@ use pliant_modal::Body;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{LabError, progress::Progress};
+use crate::{LabError, experiment::Experiment, machine, progress::Progress};
 
 /// Largest number of threads that run cases.
 const MAX_THREADS: usize = 64;
@@ -85,11 +87,15 @@ struct CaseOutcome {
     plain: Option<String>,
     /// See [`Verdict::phases`].
     phases: Option<[f64; 2]>,
+    /// See [`Verdict::damping`].
+    damping: Option<[f64; 2]>,
+    /// See [`Verdict::relaxation`].
+    relaxation: Option<[f64; 2]>,
 }
 
 impl CaseOutcome {
     fn of(bounds: Vec<Bound>) -> Self {
-        Self { bounds, plain: None, phases: None }
+        Self { bounds, ..Self::default() }
     }
 
     /// Adds the result of the paper's plain scheme.
@@ -97,11 +103,22 @@ impl CaseOutcome {
         Self { plain: Some(plain), ..self }
     }
 
-    /// Adds the phases of the body's slowest and fastest mode in a step.
+    /// Adds what the body's motion depends on in numbers without a unit: the phases of its slowest
+    /// and fastest mode in a step, their damping ratios, and its relaxation.
     fn stepped(self, body: &Body) -> Self {
-        let phase = |omega: Option<&f64>| omega.map(|omega| omega * body.config().step);
-        let phases = phase(body.omega().first()).zip(phase(body.omega().last())).map(Into::into);
-        Self { phases, ..self }
+        let step = body.config().step;
+        let ends = |of: &dyn Fn(f64, f64) -> f64| {
+            let modes: Vec<_> = body.omega().iter().zip(body.damping()).collect();
+            let at = |mode: &(&f64, &f64)| of(*mode.0, *mode.1);
+            Some([at(modes.first()?), at(modes.last()?)])
+        };
+        let relaxation = body.config().settings.relaxation;
+        Self {
+            phases: ends(&|omega, _| omega * step),
+            damping: ends(&|omega, damping| damping / (2.0 * omega)),
+            relaxation: relaxation.map(|relaxation| [relaxation.ratio, relaxation.time / step]),
+            ..self
+        }
     }
 }
 
@@ -186,13 +203,20 @@ pub struct Verdict {
     /// Stiffness, density, size and step act on the motion through them alone: two cases of one
     /// script with equal phases and equal damping ratios differ by rounding only.
     pub phases: Option<[f64; 2]>,
+    /// Damping ratios of these two modes.
+    pub damping: Option<[f64; 2]>,
+    /// Share of the stiffness that relaxes, and the time in which it does, steps.
+    pub relaxation: Option<[f64; 2]>,
     /// The reason why the case does not pass, if that is a known limit and the result is the
     /// expected one.
     pub known_limit: Option<&'static str>,
+    /// What each number of a known limit may be: its name, the least and the most. None if the
+    /// bake refuses the mesh.
+    pub permitted: Vec<(&'static str, f64, f64)>,
     /// True if the case is listed as a known limit but passes. The list is out of date, so the case
     /// counts as broken.
     pub limit_gone: bool,
-    /// The result of the paper's plain scheme with the same script.
+    /// The result of the paper's way with the same script, which [`Verdict::papers_way`] names.
     pub plain: Option<String>,
     /// Run time of the case, s.
     pub seconds: f64,
@@ -203,6 +227,14 @@ impl Verdict {
     pub fn broken(&self) -> bool {
         self.limit_gone || (!self.passed && self.known_limit.is_none())
     }
+
+    /// What [`Verdict::plain`] is the result of.
+    pub fn papers_way(&self) -> &'static str {
+        match self.group {
+            network::GROUP => "the paper's repair with the paper's integrator, and no repair",
+            _ => "the paper's plain scheme",
+        }
+    }
 }
 
 /// The verdicts of all cases.
@@ -212,6 +244,8 @@ pub struct StabilityReport {
     pub cases: Vec<Verdict>,
     /// Run time of all cases, s.
     pub seconds: f64,
+    /// How the matrix was run: date, command, version, machine, seeds and load.
+    pub made: String,
 }
 
 impl StabilityReport {
@@ -242,7 +276,7 @@ fn all() -> Vec<Case> {
 /// Returns [`LabError::Threads`] if the threads cannot be started. Errors within a case become its
 /// verdict.
 pub fn run(settings: &StabilitySettings, progress: &mut dyn Progress) -> Result<StabilityReport, LabError> {
-    let began = Instant::now();
+    let (began, load) = (Instant::now(), machine::load());
     let wanted = |case: &Case| {
         settings
             .only
@@ -273,7 +307,12 @@ pub fn run(settings: &StabilitySettings, progress: &mut dyn Progress) -> Result<
             })
             .collect()
     });
-    Ok(StabilityReport { cases, seconds: began.elapsed().as_secs_f64() })
+    let seconds = began.elapsed().as_secs_f64();
+    let only = settings.only.as_ref().map_or_else(String::new, |text| format!(" --only \"{text}\""));
+    let seeds =
+        format!("The networks have the seed {}, random velocities those of their names", Experiment::SEED);
+    let made = machine::made(&format!("pliant stability{only}"), seconds, &seeds, load);
+    Ok(StabilityReport { cases, seconds, made })
 }
 
 fn judge(case: &Case) -> Verdict {
@@ -302,7 +341,11 @@ fn judge(case: &Case) -> Verdict {
             (0.0, format!("panicked: {words}"), CaseOutcome::default(), None)
         }
     };
-    let CaseOutcome { bounds, plain, phases } = outcome;
+    let permitted = match case.known_limit.map(|limit| limit.expected) {
+        Some(Expected::Measured(known)) if known_limit.is_some() => known.to_vec(),
+        _ => Vec::new(),
+    };
+    let CaseOutcome { bounds, plain, phases, damping, relaxation } = outcome;
     let passed = margin >= 1.0;
     Verdict {
         name: case.name.clone(),
@@ -312,7 +355,10 @@ fn judge(case: &Case) -> Verdict {
         bound,
         bounds,
         phases,
+        damping,
+        relaxation,
         known_limit,
+        permitted,
         limit_gone: passed && case.known_limit.is_some(),
         plain,
         seconds: began.elapsed().as_secs_f64(),

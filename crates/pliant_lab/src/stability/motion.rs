@@ -6,11 +6,16 @@ use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, Relaxation, 
 use super::{
     Bound, Case, CaseOutcome, Expected,
     bodies::{
-        BarBody, Dice, HeldCase, energy_growth, gain, nearest, no_growth, settling, state, static_pull,
+        BarBody, Dice, HeldCase, RESTED, energy_growth, gain, nearest, no_growth, settling, state,
+        static_pull,
     },
     material::word,
 };
 use crate::LabError;
+
+/// What rounding may add in 100,000 steps, as a share, if it always adds: a spacing of numbers near 1
+/// in each.
+const DRIFT: f64 = 1e5 * f64::EPSILON;
 
 const FAR_AND_FAST: &str = "the held patch is lengths away from its rest: a pull there turns the warp's rows within a step of 1/60 s, and its work over the step is not what it was taken to be; at 1/240 s, or without the warp, the same start is quiet";
 
@@ -84,7 +89,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             let drift = if damped { left } else { left - 1.0 };
             Ok(CaseOutcome::of(vec![
                 no_growth(growth),
-                Bound::new("energy gained in all / energy", drift.max(0.0), 1e-8),
+                Bound::new("energy gained in all / energy", drift.max(0.0), 1e6 * f64::EPSILON),
             ]))
         }));
     }
@@ -93,7 +98,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 /// The known result at 1/60 s of a held start whose patch is lengths away from its rest: the body
 /// is not at rest at the end.
 fn far_and_fast(shape: [f64; 3]) -> Option<Expected> {
-    let unrest = Expected::Measured(&[("kinetic energy at the end / energy at the start", 1e-6, 1.0)]);
+    let unrest = Expected::Measured(&[("kinetic energy at the end / energy at the start", 0.05, 0.09)]);
     (shape[0] > 1.0).then_some(unrest)
 }
 
@@ -141,7 +146,7 @@ fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<CaseOut
     }
     Ok(CaseOutcome::of(vec![
         gain("largest energy / energy at the start - 1", most),
-        Bound::new("kinetic energy at the end / energy at the start", last[1] / start, 1e-6),
+        Bound::new("kinetic energy at the end / energy at the start", last[1] / start, RESTED),
     ])
     .stepped(&body))
 }
@@ -165,11 +170,12 @@ fn flight(step: f64) -> Result<CaseOutcome, LabError> {
         body.step()?;
     }
     let (p1, l1) = momentum(&body);
+    let arm = Vector3::from(body.frame().center()).norm() * p1.norm();
     Ok(CaseOutcome::of(vec![
-        Bound::new("linear momentum lost / momentum", (p1 - p0).norm() / p0.norm(), 1e-9),
-        // Angular momentum is taken about the world's origin. The body is up to a thousand lengths
-        // away by then, and rounding errors grow with the distance.
-        Bound::new("angular momentum lost / momentum", (l1 - l0).norm() / l0.norm(), 1e-6),
+        Bound::new("linear momentum lost / momentum", (p1 - p0).norm() / p0.norm(), DRIFT),
+        // Angular momentum is taken about the world's origin, from which the body is thousands of
+        // lengths away by then.
+        Bound::new("angular momentum lost / that of the flight", (l1 - l0).norm() / (l0.norm() + arm), DRIFT),
     ])
     .stepped(&body))
 }
@@ -195,8 +201,8 @@ fn spinning(turns: f64, step: f64) -> Result<CaseOutcome, LabError> {
         lost = lost.max((Vector3::from(body.frame().spin()) - spin).norm() / spin.norm());
     }
     Ok(CaseOutcome::of(vec![
-        Bound::new("largest gain of the spin's energy / energy", gained, 1e-8),
-        Bound::new("angular momentum lost / momentum", lost, 1e-9),
+        Bound::new("largest gain of the spin's energy / energy", gained, DRIFT),
+        Bound::new("angular momentum lost / momentum", lost, DRIFT),
     ])
     .stepped(&body))
 }
@@ -209,11 +215,14 @@ fn counted(step: f64) -> Result<CaseOutcome, LabError> {
     let a = body.grab(&bar.tip(&model)?, GrabConfig::default())?;
     let other = pliant_modal::Patch::around(model.surface(), bar.vertex(&model, [0.0, 0.5, 0.5]), 0.12)?;
     let b = body.grab(&other, GrabConfig::default())?;
-    let (mut worst, mut largest) = (0.0f64, 0.0f64);
+    let (mut worst, mut largest, mut farthest) = (0.0f64, 0.0f64, 0.0f64);
     for i in 0..2_000 {
         let t = f64::from(i) * step;
-        body.set_target(a, [1.0 + 0.5 * t.sin(), 0.3, 0.1 * t.sin()])?;
-        body.set_target(b, [-0.5, 0.2 * t.cos(), 0.0])?;
+        let targets = [[1.0 + 0.5 * t.sin(), 0.3, 0.1 * t.sin()], [-0.5, 0.2 * t.cos(), 0.0]];
+        for (grab, target) in [a, b].into_iter().zip(targets) {
+            body.set_target(grab, target)?;
+            farthest = farthest.max(Vector3::from(target).norm());
+        }
         let before = Vector3::from(body.momentum().0);
         body.step()?;
         let change = (Vector3::from(body.momentum().0) - before) / step;
@@ -227,8 +236,9 @@ fn counted(step: f64) -> Result<CaseOutcome, LabError> {
         largest = largest.max(Vector3::from(body.frame().center()).norm());
     }
     Ok(CaseOutcome::of(vec![
-        Bound::new("|momentum's change - hands' pulls| / pulls", worst, 1e-6),
-        Bound::new("farthest from the hands / m", largest, 10.0),
+        Bound::new("|momentum's change - hands' pulls| / pulls", worst, 1e-12),
+        // Twice as far as a hand ever is: overshoot is physical.
+        Bound::new("farthest from the origin / the hands' farthest", largest / farthest, 2.0),
     ])
     .stepped(&body))
 }
@@ -263,7 +273,7 @@ fn relaxed_reaction(relaxation: Relaxation) -> Result<CaseOutcome, LabError> {
     Ok(CaseOutcome::of(vec![Bound::new(
         "|reaction - relaxed| / relaxed",
         (got - want).norm() / want.norm(),
-        5e-3,
+        2e-4,
     )])
     .stepped(&held.body))
 }

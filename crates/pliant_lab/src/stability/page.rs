@@ -4,15 +4,18 @@ use std::fmt::Write;
 
 use super::{StabilityReport, Verdict};
 
-/// The text above the tables.
+/// The text above the stamp.
 const HEAD: &str = "\
 # The stability matrix
 
 `pliant stability -o docs/report/stability.md` makes this page. A bound compares a measured number
 with a limit. The margin is the limit over the number, for the tightest bound of a case: with 1 the
-bound just holds. The phases are those of the slowest and the fastest mode in a step. Stiffness,
-density, size and step act on the motion through them alone, so that two cases of one script with
-the same phases, damping ratios and relaxation are one case for the arithmetic, in other units.
+bound just holds. The phases are those of the slowest and the fastest mode in a step, and zeta is
+the damping ratio of these (one number where both have the same). Stiffness, density, size and step
+act on the motion through phases, damping ratios and relaxation alone, so that two cases of one
+script that have these alike are one case for the arithmetic, in other units. The column of dynamics
+counts those that differ. Numbers far below 1e-9 are rounding, and differ from processor to
+processor. A tool at 0 m/s is held by the friction of its device, 0.26 N as in a Touch.
 
 ";
 
@@ -21,6 +24,7 @@ impl StabilityReport {
     /// bound.
     pub fn page(&self) -> String {
         let mut page = HEAD.to_owned();
+        let _ = writeln!(page, "{}\n", self.made);
         let mut groups: Vec<&'static str> = Vec::new();
         for case in &self.cases {
             if !groups.contains(&case.group) {
@@ -28,7 +32,7 @@ impl StabilityReport {
             }
         }
         let of = |group: &'static str| self.cases.iter().filter(move |case| case.group == group);
-        page += "| group | cases | keep their bounds | known limits | pairs of phases | smallest margin |\n";
+        page += "| group | cases | keep their bounds | known limits | dynamics | smallest margin |\n";
         page += "| --- | --- | --- | --- | --- | --- |\n";
         let row = |page: &mut String, name: &str, cases: Vec<&Verdict>| {
             let passed = cases.iter().filter(|case| case.passed).count();
@@ -39,7 +43,7 @@ impl StabilityReport {
                 page,
                 "| {name} | {} | {passed} | {limits} | {} | {} |",
                 cases.len(),
-                pairs(&cases).map_or_else(|| "-".to_owned(), |n| n.to_string()),
+                dynamics(&cases).map_or_else(|| "-".to_owned(), |n| n.to_string()),
                 margin(least)
             );
         };
@@ -47,13 +51,29 @@ impl StabilityReport {
             row(&mut page, group, of(group).collect());
         }
         row(&mut page, "all", self.cases.iter().collect());
-        page += "\n## Known limits\n";
-        let mut reasons: Vec<&'static str> = self.cases.iter().filter_map(|case| case.known_limit).collect();
-        reasons.dedup();
+        page += "\n## Known limits\n\nA known limit breaks a bound for a reason. It passes if each number that breaks its bound is\nwithin its range, and all others keep theirs. Any other result fails, a better one too.\n";
+        let mut reasons: Vec<&'static str> = Vec::new();
+        for why in self.cases.iter().filter_map(|case| case.known_limit) {
+            if !reasons.contains(&why) {
+                reasons.push(why);
+            }
+        }
         for why in reasons {
             let _ = writeln!(page, "\nThe reason of these: {why}.\n");
+            page += "| case | number | measured | bound | may be |\n| --- | --- | --- | --- | --- |\n";
             for case in self.cases.iter().filter(|case| case.known_limit == Some(why)) {
-                let _ = writeln!(page, "- {}, {}: {}", case.group, case.name, case.bound);
+                let name = format!("{}, {}", case.group, case.name);
+                if case.permitted.is_empty() {
+                    let _ = writeln!(page, "| {name} | {} | | | refused |", case.bound.replace('|', "\\|"));
+                }
+                for (what, low, high) in &case.permitted {
+                    for bound in case.bounds.iter().filter(|bound| bound.what == *what) {
+                        let what = what.replace('|', "\\|");
+                        let (got, limit) = (bound.measured, bound.limit);
+                        let _ =
+                            writeln!(page, "| {name} | {what} | {got:.3e} | {limit:.3e} | {low} to {high} |");
+                    }
+                }
             }
         }
         if self.broken() > 0 {
@@ -64,13 +84,13 @@ impl StabilityReport {
         }
         for group in groups {
             let _ = writeln!(page, "\n## {group}\n");
-            let beside = of(group).any(|case| case.plain.is_some());
-            page += "| case | phases / rad | margin | tightest bound |";
-            page += if beside { " the paper's plain scheme |\n" } else { "\n" };
+            let beside = of(group).find(|case| case.plain.is_some());
+            page += "| case | phases / rad, zeta | margin | tightest bound |";
+            page += &beside.map_or_else(|| "\n".to_owned(), |case| format!(" {} |\n", case.papers_way()));
+            let beside = beside.is_some();
             page += if beside { "| --- | --- | --- | --- | --- |\n" } else { "| --- | --- | --- | --- |\n" };
             for case in of(group) {
-                let phases =
-                    case.phases.map_or_else(|| "-".to_owned(), |[a, b]| format!("{a:.2e} to {b:.2e}"));
+                let phases = motion(case).unwrap_or_else(|| "-".to_owned());
                 let mark = match (case.passed, case.known_limit) {
                     (true, _) => "",
                     (false, Some(_)) => " (known limit)",
@@ -92,13 +112,27 @@ impl StabilityReport {
     }
 }
 
-/// The number of pairs of phases among cases, to three digits, if they have phases.
-fn pairs(cases: &[&Verdict]) -> Option<usize> {
-    let mut all: Vec<String> = cases
-        .iter()
-        .filter_map(|case| case.phases)
-        .map(|[slow, fast]| format!("{slow:.2e} {fast:.2e}"))
-        .collect();
+/// What the motion of a case depends on, to three digits: phases, damping ratios and relaxation.
+fn motion(case: &Verdict) -> Option<String> {
+    let [slow, fast] = case.phases?;
+    let mut text = format!("{slow:.2e} to {fast:.2e}");
+    // Writing to a string cannot fail.
+    if let Some([first, last]) = case.damping.map(|zeta| zeta.map(|zeta| (1e3 * zeta).round() / 1e3)) {
+        let _ = if first == last {
+            write!(text, ", zeta {first}")
+        } else {
+            write!(text, ", zeta {first} to {last}")
+        };
+    }
+    if let Some([ratio, steps]) = case.relaxation {
+        let _ = write!(text, ", {ratio} relaxes in {steps:.2e} steps");
+    }
+    Some(text)
+}
+
+/// The number of different motions among cases, if they tell theirs.
+fn dynamics(cases: &[&Verdict]) -> Option<usize> {
+    let mut all: Vec<String> = cases.iter().filter_map(|case| motion(case)).collect();
     all.sort();
     all.dedup();
     (!all.is_empty()).then_some(all.len())
