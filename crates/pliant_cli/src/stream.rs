@@ -24,7 +24,7 @@ use crate::{CliError, output};
 
 #[derive(Args, Debug)]
 #[command(
-    after_help = "hand_to_force_ms is measured between peers: the longest time from a position of the own hand to the first step whose force has it. Else it is reckoned: for force-driven repair one step by construction, as the own copy answers at its next step; for the others half the measured round trip, half a step and the measured delay of showing."
+    after_help = "hand_to_force_ms is measured between peers: the longest time from a position of the own hand to the first step whose force has it. Else it is reckoned: for force-driven repair one step by construction, as the own copy answers at its next step; for the others half the measured round trip, half a step and the measured delay of showing. visual_delay_ms is the mean time from the host's step to the showing of its tick, and between peers the mean age of the newest tick of which all targets are known."
 )]
 pub(crate) struct StreamArgs {
     /// The body
@@ -266,5 +266,8 @@ fn table(all: &[StreamMetrics]) -> String {
             t.cpu_us_per_tick
         );
     }
+    text.push_str(
+        "hand ms is measured between peers and reckoned for the others; late ms is the age of what is shown (see --help)",
+    );
     text
 }

@@ -233,7 +233,8 @@ fn ways_of_repair_are_compared_alike_and_at_their_best() {
     let part = Part::of("network");
     let (equal, best) = part.text.split_once("Each way with the playout delay").unwrap();
     // Network, way, settings, rms, rms of the motion, largest, missing, force, calm shape, calm
-    // force, delay.
+    // force, delay, down, up, time, least, median and most of several seeds.
+    let [delay, down, up, least, median, most] = [7, 8, 9, 11, 12, 13];
     let rows = |text| -> Vec<(String, String, String, Vec<f64>)> {
         Part::table(text, "| network | repair |")
             .iter()
@@ -244,36 +245,60 @@ fn ways_of_repair_are_compared_alike_and_at_their_best() {
             .collect()
     };
     let (equal, best) = (rows(equal), rows(best));
-    let ways = ["default", "force-driven", "paper", "paper-zero", "paper-hold", "none"];
-    assert_eq!((equal.len(), best.len()), (64, 64));
+    let searched = ["default", "force-driven", "paper", "paper-zero", "paper-hold", "none"];
+    let in_one = ["paper, 1 step", "paper-zero, 1 step", "paper-hold, 1 step"];
+    let peers = ["peers, rollback", "peers, compensate"];
+    assert_eq!((equal.len(), best.len()), (8 * 11, 8 * 8));
     // In the first table, all but the peers have the same settings, and so nearly the same delay.
-    for row in equal.iter().filter(|row| ways.contains(&row.1.as_str())) {
+    for row in &equal {
         let default = equal.iter().find(|d| d.0 == row.0 && d.1 == "default").unwrap();
-        assert_eq!(row.2, default.2, "{row:?}");
-        assert!((row.3[7] - default.3[7]).abs() <= 2.0, "delays: {row:?}, {default:?}");
-        // The default is nearest to the true shape, or as near as the quanta and the tremor allow.
-        assert!(default.3[1] < 1.05 * row.3[1] + 0.05, "{row:?}, {default:?}");
+        let [sent, back] = [row.3[down], row.3[up]];
+        assert!(row.3[least] <= row.3[median] && row.3[median] <= row.3[most], "{row:?}");
+        if peers.contains(&row.1.as_str()) {
+            // Each peer sends the targets of one hand, and nothing else.
+            assert!(row.2.starts_with("0, 3, ") && (sent / back - 1.0).abs() < 0.1, "{row:?}");
+            assert!(sent + back < default.3[down] + default.3[up], "{row:?}, {default:?}");
+            // What a peer knows of the other is older than the path, and hardly older than the
+            // picture of a guest, which waits a tick for repeats.
+            let path = match row.0.split(',').next().unwrap() {
+                "paper-1" => 98.0,
+                "paper-2" => 60.0,
+                "paper-3" => 30.0,
+                _ => 10.0,
+            };
+            assert!((path..default.3[delay] + 40.0).contains(&row.3[delay]), "{row:?}, {default:?}");
+            continue;
+        }
+        assert!(row.2.starts_with("1, 3, "), "{row:?}");
+        assert_eq!(row.2.ends_with(", 1"), in_one.contains(&row.1.as_str()), "{row:?}");
+        assert!((row.3[delay] - default.3[delay]).abs() <= 2.0, "delays: {row:?}, {default:?}");
+        // All guests send the same: targets, the clock and what they lack.
+        assert!((back / default.3[up] - 1.0).abs() < 0.1 && back > 5.0 && back < sent, "{row:?}");
+        // The default is nearest to the true shape, or as near as the quanta and the tremor allow,
+        // but for the paper's ways in one step, which are nearer under a jitter of 30 ms.
+        let more = if in_one.contains(&row.1.as_str()) { 1.3 } else { 1.05 };
+        assert!(default.3[median] < more * row.3[median] + 0.05, "{row:?}, {default:?}");
     }
-    let rms = |rows: &[(String, String, String, Vec<f64>)], network: &str, way: &str| {
-        rows.iter().find(|row| row.0 == network && row.1 == way).unwrap().3[1]
+    let of = |rows: &[(String, String, String, Vec<f64>)], network: &str, way: &str| {
+        rows.iter().find(|row| row.0 == network && row.1 == way).unwrap().3[median]
     };
-    for way in ways.iter().chain(&["peers, rollback", "peers, compensate"]) {
-        // Its own best is at least as good as the settings of the first table, which are among
-        // those that are tried.
-        for (first, own) in equal.iter().zip(&best).filter(|(first, _)| first.1 == *way) {
-            assert_eq!((&first.0, &first.1), (&own.0, &own.1));
-            assert!(own.3[1] <= 1.011 * first.3[1] + 1e-4, "{first:?}, {own:?}");
+    for way in searched.iter().chain(&in_one).chain(&peers) {
+        // Its own best, found on other seeds, is no worse than the settings of the first table,
+        // which are among those that are tried.
+        for own in best.iter().filter(|own| own.1 == *way) {
+            let first = equal.iter().find(|first| (&first.0, &first.1) == (&own.0, &own.1)).unwrap();
+            assert!(own.3[median] <= 1.05 * first.3[median] + 1e-3, "{first:?}, {own:?}");
         }
         // The figures are the first table.
         let drawn = part.line("f-network", way);
         let timed = part.line("f-network-time", way);
         assert_eq!((drawn.len(), timed.len()), (4, 4));
         for (k, network) in ["paper-1", "paper-2", "paper-3", "paper-4"].iter().enumerate() {
-            let told = rms(&equal, network, way);
+            let told = of(&equal, network, way);
             assert!((drawn[k].1 - told.max(1e-5)).abs() < 1e-4 + 2e-3 * told, "{network}, {way}: {told}");
             assert!((0.1..1e4).contains(&timed[k].0), "{way}");
         }
-        assert!(rms(&equal, "paper-1", way) > rms(&equal, "paper-4", way), "more loss, more error: {way}");
+        assert!(of(&equal, "paper-1", way) > of(&equal, "paper-4", way), "more loss, more error: {way}");
         // Jitter and bursts are the axes of two figures, of the same table.
         for (figure, axis) in [
             ("f-network-jitter", [(0.0, ""), (10.0, ", jitter 10 ms"), (30.0, ", jitter 30 ms")]),
@@ -282,17 +307,26 @@ fn ways_of_repair_are_compared_alike_and_at_their_best() {
             let drawn = part.line(figure, way);
             assert_eq!(drawn.len(), 3, "{figure}, {way}");
             for ((x, what), at) in axis.iter().zip(&drawn) {
-                let told = rms(&equal, &format!("paper-1{what}"), way);
+                let told = of(&equal, &format!("paper-1{what}"), way);
                 // The table has four decimals, and the file four digits.
                 let off = (at.1 - told).abs();
-                assert!(at.0 == *x && off < 6e-5 + 1e-3 * told, "{figure}, {way}: {at:?}, {told}");
+                assert!(at.0 == *x && off < 1.2e-4 + 1e-3 * told, "{figure}, {way}: {at:?}, {told}");
             }
         }
+    }
+    // A delay of 16 ticks is longer than a round trip, so that what was lost arrives in time.
+    for way in searched {
+        for figure in ["f-network-delay", "f-network-delay-bursts"] {
+            let line = part.line(figure, way);
+            assert!(line.len() == 2 && last(&line) <= line[0].1, "{figure}, {way}: {line:?}");
+        }
+        let [short, long] = part.line("f-network-delay", way)[..] else { panic!("{way}") };
+        assert!(short.1 > 0.015 && long.1 < 0.01, "{way}: {short:?}, {long:?}");
     }
     // Without loss nothing is missing. A burst of twelve ticks shows in every way of repair.
     assert!(equal.iter().filter(|row| row.0 == "paper-4").all(|row| row.3[3] == 0.0));
     for way in ["default", "paper"] {
-        assert!(rms(&equal, "paper-1, bursts of 12", way) > rms(&equal, "paper-1", way), "{way}");
+        assert!(of(&equal, "paper-1, bursts of 12", way) > of(&equal, "paper-1", way), "{way}");
     }
 }
 
@@ -351,6 +385,67 @@ fn the_front_is_what_was_measured_and_so_is_the_advice() {
     let (_, least) = part.text.split_once("what is seen and what is felt are off by ").unwrap();
     let told = number_after(least, " cells; by ");
     assert!((told - 100.0 * best("four-node, 4 x 2 x 2 cells")).abs() < 0.006, "{told}");
+}
+
+#[test]
+fn table_2_has_our_own_body_for_what_is_not_there() {
+    let part = Part::of("table-2");
+    let rows = Part::table(&part.text, "| body | tetrahedra |");
+    let names: Vec<&str> = rows.iter().map(|row| row[0]).collect();
+    assert_eq!(
+        names,
+        ["bar", "own body, for the bunny", "own body, for the armadillo", "own body, for the dragon"]
+    );
+    assert_eq!(rows.iter().map(|row| row[2]).collect::<Vec<_>>(), ["20", "60", "120", "100"]);
+    let number = |row: usize, cell: usize| number_after(rows[row][cell], "");
+    // The paper's bar, and the own body with one in forty of the paper's tetrahedra.
+    assert_eq!(number(0, 1), 1_080.0);
+    for (row, tets) in [(1, 50_000.0), (2, 49_729.0), (3, 100_000.0)] {
+        let share = number(row, 1) / (tets / 40.0);
+        assert!((0.5..2.0).contains(&share), "{row}: {share} of the tetrahedra asked for");
+    }
+    for (row, paper) in [1124.2, 264.2, 134.8, 56.8].into_iter().enumerate() {
+        // A frame is a step and a surface. The steps a second are those of the median frame, and
+        // the ratio is that to the paper's. The frame has one decimal.
+        let (step, frame, rate, ratio) = (number(row, 5), number(row, 6), number(row, 7), number(row, 8));
+        assert!(0.0 < step && step < frame, "{:?}", rows[row]);
+        assert!((rate * frame / 1e6 - 1.0).abs() < 0.06 / frame + 1e-3, "{:?}", rows[row]);
+        assert!((ratio * paper / rate - 1.0).abs() < 0.06 / ratio + 1e-3, "{:?}", rows[row]);
+    }
+}
+
+#[test]
+fn what_compensation_adds_is_measured_on_our_own_body() {
+    let part = Part::of("table-2-repair");
+    let rows = Part::table(&part.text, "| body | modes |");
+    let names: Vec<[&str; 2]> = rows.iter().map(|row| [row[0], row[1]]).collect();
+    let own = ["own body, for the bunny", "own body, for the armadillo", "own body, for the dragon"];
+    assert_eq!(names, [["bar", "20"], [own[0], "60"], [own[1], "120"], [own[2], "100"]]);
+    for row in &rows {
+        let number = |cell: usize| number_after(row[cell], "");
+        let (without, with, times) = (number(2), number(3), number(4));
+        // The medians of the times and of the ratios are not of the same session, and the largest
+        // and the least ratio have the median between them.
+        assert!(without > 0.0 && (0.5..2.0).contains(&(with / without / times)), "{row:?}");
+        let (least, most) = (number(5), number_after(row[5], " to "));
+        assert!(least <= times && times <= most, "{row:?}");
+    }
+}
+
+#[test]
+fn the_default_is_told_of_our_own_body() {
+    let part = Part::of("default");
+    assert_eq!(part.text.matches("The own body, ").count(), 2, "{}", part.text);
+    assert!(!part.text.contains("bunny"), "{}", part.text);
+    let (four, ten) = part.text.split_once("ten-node tetrahedra (the default of the bake)").unwrap();
+    let pulls = |text| -> Vec<f64> {
+        let rows = Part::table(text, "| pulled by, % of the size |");
+        rows.iter().map(|row| number_after(row[0], "")).collect()
+    };
+    let (four, ten) = (pulls(four), pulls(ten));
+    assert_eq!((four.len(), ten.len()), (4, 2));
+    assert!(four.windows(2).chain(ten.windows(2)).all(|pair| pair[0] < pair[1]), "{four:?}, {ten:?}");
+    assert!(part.text.contains("In other words: if the own body is pulled by "), "{}", part.text);
 }
 
 #[test]

@@ -72,6 +72,8 @@ pub struct Experiment {
     /// Earlier ticks that each datagram between peers repeats. Default: that of
     /// [`PeerSessionConfig`].
     pub peer_repeats: usize,
+    /// Ticks over which a peer blends a correction. Default: that of [`PeerSessionConfig`].
+    pub peer_blend_ticks: u16,
     /// The guest also holds the body, where the first hand does, and sends its target every tick.
     /// This measures the traffic from guest to host. The host does not act on the hand, so the
     /// errors are meaningless then. Default: false.
@@ -166,6 +168,10 @@ pub struct Metrics {
     /// is half the round trip, half a step and the mean visual delay.
     pub hand_to_force_ms: f64,
     /// Mean time from the host's step to the showing of its tick, ms.
+    ///
+    /// A peer shows its own step at once. Between peers it is the mean age of the newest tick all
+    /// of whose targets have acted in the second peer's picture, from the first peer's step of that
+    /// tick on: how late the second peer sees the other's hand right.
     pub visual_delay_ms: f64,
     /// Longest time for which the visual error stayed above 0.5 %, ms.
     pub recover_ms: f64,
@@ -231,6 +237,7 @@ impl Experiment {
             quantum: HostSessionConfig::default().quantum,
             cpu_clock: None,
             peer_repeats: PeerSessionConfig::default().repeats,
+            peer_blend_ticks: PeerSessionConfig::default().blend_ticks,
             guest_hand: false,
             keep_track: false,
         }

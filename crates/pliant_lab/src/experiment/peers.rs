@@ -51,6 +51,8 @@ struct Session {
     spent: Duration,
     /// Longest time from a position of the second peer's hand to a force that has it.
     answered: Duration,
+    /// Mean age of what the second peer knows whole when it shows a step.
+    known: Duration,
 }
 
 impl Experiment {
@@ -78,9 +80,10 @@ impl Experiment {
         let h = 1.0 / self.rate;
         let settings = self.settings();
         let peer = |number: u16| -> Result<PeerSession, StreamError> {
-            let repeats = self.peer_repeats;
+            let (repeats, blend_ticks) = (self.peer_repeats, self.peer_blend_ticks);
+            let user = UserId(number);
             let config =
-                PeerSessionConfig { user: UserId(number), step: h, repair, repeats, ..Default::default() };
+                PeerSessionConfig { user, step: h, repair, repeats, blend_ticks, ..Default::default() };
             let mut peer = PeerSession::new(config)?;
             peer.add_body(BODY, self.model.clone(), &settings)?;
             Ok(peer)
@@ -109,6 +112,9 @@ impl Experiment {
         let mut agreed = Agreed::default();
         // The positions of the second peer's first hand that no force has answered yet.
         let (mut unanswered, mut answered) = (VecDeque::<(Duration, [f64; 3])>::new(), Duration::ZERO);
+        // When the first peer made its last steps, and the ages of what the second knows whole.
+        let mut steps = BTreeMap::<Tick, Duration>::new();
+        let (mut ages, mut shown) = (Duration::ZERO, 0_u32);
         let mut sets: Vec<(Vec<HeldPlace>, Option<Arc<HeldShapes>>)> = Vec::new();
         let mut now = Duration::ZERO;
         let until = SETTLED + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
@@ -162,6 +168,10 @@ impl Experiment {
                     sets.drain(..excess);
                 }
                 while peers[k].poll_event().is_some() {}
+                if k == 0 {
+                    let tick = peers[0].tick();
+                    steps.extend((0..stepped).map(|before| (tick.saturating_sub(before), now)));
+                }
                 if k == 1
                     && stepped > 0
                     && now >= SETTLED
@@ -179,6 +189,11 @@ impl Experiment {
                     }
                     // What is never answered has been waiting since then.
                     answered = unanswered.front().map_or(answered, |(at, _)| answered.max(now - *at));
+                    let known = peers[1].confirmed();
+                    steps = steps.split_off(&known);
+                    if let Some(at) = steps.get(&known) {
+                        (ages, shown) = (ages + (now - *at), shown + 1);
+                    }
                     seen.insert(
                         peers[1].tick(),
                         PeerSample {
@@ -212,7 +227,8 @@ impl Experiment {
         }
         let link = &links[0][0];
         let (lost, hash) = (link.counts().lost, link.hash());
-        Ok(Session { seen, agreed, lost, sent, hash, spent, answered })
+        let known = ages / shown.max(1);
+        Ok(Session { seen, agreed, lost, sent, hash, spent, answered, known })
     }
 
     fn peer_metrics(&self, session: &Session, agreed: &Agreed) -> Metrics {
@@ -276,6 +292,7 @@ impl Experiment {
             / force_scale.max(1e-12);
         let own = self.hands.len() > 1;
         f.hand_to_force_ms = if own { session.answered.as_secs_f64() * 1e3 } else { f64::NAN };
+        f.visual_delay_ms = session.known.as_secs_f64() * 1e3;
         f.recover_ms = longest.as_secs_f64() * 1e3;
         let [down, up] = *sent;
         f.bytes_per_frame = down.1 as f64 / down.0.max(1) as f64;

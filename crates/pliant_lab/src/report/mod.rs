@@ -245,14 +245,18 @@ fn measure(
         Part::Network => networks::networks(quick, progress)?,
         Part::Front => front::all_together(quick, progress)?,
         Part::Elasticity => elasticity::elasticity(quick)?,
-        Part::Table2 => (Vec::new(), tables::table_2(models, own, if quick { 0.3 } else { 2.0 }, progress)?),
+        Part::Table2 => {
+            let size = if quick { (0.05, 40) } else { (2.0, 1) };
+            (Vec::new(), tables::table_2(models, own, size, progress)?)
+        }
         Part::Table2Repair => {
-            (Vec::new(), tables::table_2_repair(models, own, if quick { 2.0 } else { 10.0 }, progress)?)
+            let size = if quick { (1.0, 40) } else { (10.0, 4) };
+            (Vec::new(), tables::table_2_repair(models, own, size, progress)?)
         }
         Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
         Part::Courses => (courses::courses()?, String::new()),
         Part::Default => {
-            let tets = if quick { [12_000, 2_000] } else { [50_000, 12_000] };
+            let tets = if quick { [2_000, 500] } else { [50_000, 12_000] };
             (Vec::new(), tables::default_setting(models, own, tets, progress)?)
         }
     })

@@ -98,7 +98,7 @@ const ROW: u32 = 20;
 const COLUMNS: u32 = 2;
 
 fn color(index: usize) -> RGBColor {
-    const COLORS: [RGBColor; 9] = [
+    const COLORS: [RGBColor; 11] = [
         RGBColor(27, 158, 119),
         RGBColor(217, 95, 2),
         RGBColor(117, 112, 179),
@@ -108,6 +108,8 @@ fn color(index: usize) -> RGBColor {
         RGBColor(31, 120, 180),
         RGBColor(90, 90, 90),
         RGBColor(0, 0, 0),
+        RGBColor(227, 26, 28),
+        RGBColor(230, 171, 2),
     ];
     COLORS[index % COLORS.len()]
 }
