@@ -64,6 +64,9 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     // Without recovery, an acceleration stream never loses an error.
     assert!(number(&run("none", "7"), "rms_percent") > 100.0 * number(&default, "rms_percent"));
 
+    // The guest's own copy answers a hand at its next step: 25 ms by construction, see `--help`.
+    assert_eq!(number(&default, "hand_to_force_ms"), 25.0, "{default}");
+
     let keys: Vec<&String> = default.as_object().unwrap().keys().collect();
     let promised = "ticks lost recovered rms_percent max_percent end_percent force_rms_percent force_ringing \
         hand_to_force_ms visual_delay_ms recover_ms bytes_per_frame kbit_s cpu_us_per_tick hash";
@@ -86,9 +89,12 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
         // position changes every 5 ms, so that the oldest one that a step answers is 20 ms old.
         assert!((715.0..=721.0).contains(&number(&told, "ticks")), "{told}");
         assert!((15.0..=25.0).contains(&number(&told, "hand_to_force_ms")), "{told}");
+        // A peer sees the other by the path and hardly more late, a step at most.
+        assert!((15.0..40.0).contains(&number(&told, "visual_delay_ms")), "{told}");
     }
 
     let table = succeeds(&["stream", "--model", &model, "--loss", "burst:12@140", "--seconds", "10"]);
+    assert!(table.contains("hand ms is measured between peers and reckoned for the others"), "{table}");
     for name in ["default", "none", "paper", "force-driven"] {
         assert!(table.lines().any(|line| line.starts_with(name)), "{name} in {table}");
     }
@@ -153,18 +159,28 @@ fn a_report_says_what_crosses_the_papers_networks() {
     }
 }
 
-/// Fastest of some hundred passes over as many bytes, GB/s.
-fn reads_gb_s(bytes: usize) -> f64 {
-    let source = vec![1u8; bytes];
-    let mut target = vec![0u8; bytes];
-    let pass = || {
-        let began = std::time::Instant::now();
-        target.copy_from_slice(std::hint::black_box(&source));
-        std::hint::black_box(&mut target);
-        began.elapsed().as_secs_f64()
+/// Fastest of some thousand passes over as many bytes, GB/s: plain sums in the widest registers, and
+/// comparisons of two halves by the system's library.
+fn reads_gb_s(bytes: usize) -> [f64; 2] {
+    let fastest = |pass: &mut dyn FnMut()| {
+        let mut us = f64::INFINITY;
+        for _ in 0..5_000 {
+            let began = std::time::Instant::now();
+            pass();
+            us = us.min(began.elapsed().as_secs_f64() * 1e6);
+        }
+        bytes as f64 / us.max(1e-9) * 1e-3
     };
-    let fastest = std::iter::repeat_with(pass).take(300).fold(f64::INFINITY, f64::min);
-    bytes as f64 / fastest.max(1e-9) * 1e-9
+    let numbers = vec![1f32; bytes / 4];
+    let halves = [vec![1u8; bytes / 2], vec![1u8; bytes / 2]];
+    let sum = fastest(&mut || {
+        std::hint::black_box(pliant_modal::streaming_sum(std::hint::black_box(&numbers)));
+    });
+    let compared = fastest(&mut || {
+        let [a, b] = std::hint::black_box(&halves);
+        assert!(std::hint::black_box(a == b));
+    });
+    [sum, compared]
 }
 
 #[test]
@@ -185,19 +201,28 @@ fn a_body_is_timed_against_the_memory() {
     );
     // The speed is that of the median surface: bytes per microsecond are megabytes per second.
     let median = |told: &serde_json::Value, times: &str| told[times]["p50"].as_f64().unwrap();
-    let [speed, limit] = ["bandwidth_gb_s", "bandwidth_limit_gb_s"].map(|key| told[key].as_f64().unwrap());
+    let speed = told["bandwidth_gb_s"].as_f64().unwrap();
     let expected = told["bytes"].as_f64().unwrap() / median(&told, "reconstruct_us") * 1e-3;
     assert!((speed / expected - 1.0).abs() < 1e-9, "{speed} GB/s instead of {expected}");
-    // The limit is that of this machine: reading as many bytes in this process, which fit in a
-    // cache, takes about as long.
-    let here = reads_gb_s(told["bytes"].as_u64().unwrap() as usize);
-    println!("{limit} GB/s told, {here} GB/s here");
-    assert!((here / 12.0..here * 12.0).contains(&limit), "{limit} GB/s told, {here} GB/s here");
-    // A frame is a step under a hand and a surface, and not one of them alone. The two medians need
-    // not add up to the byte, but the step must be in it.
-    let step = median(&told, "frame_us") - median(&told, "reconstruct_us");
-    let alone = median(&told, "step_us");
-    assert!((alone / 4.0..4.0 * alone).contains(&step), "a step of {step} us in a frame: {told}");
+    // The limit is that of this machine: the fastest sums of as many bytes in this process, which
+    // fit in a cache, are as fast. A frame is a step under a hand and a surface, and not one of them
+    // alone: without the surface it takes as long as a step. A core may change its speed between
+    // two timings, so that one of three runs has to be right.
+    let mut tries = Vec::new();
+    let right = (0..3).any(|_| {
+        let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
+        let limit = told["bandwidth_limit_gb_s"].as_f64().unwrap();
+        let [here, compared] = reads_gb_s(told["bytes"].as_u64().unwrap() as usize);
+        let step = median(&told, "frame_us") - median(&told, "reconstruct_us");
+        let alone = median(&told, "step_us");
+        tries.push(format!(
+            "limit {limit:.1} GB/s, by sums {here:.1} and by comparisons {compared:.1} here; a step of \
+             {step:.2} us in a frame and of {alone:.2} us alone"
+        ));
+        (0.7..1.2).contains(&(limit / here)) && (0.85..1.2).contains(&(step / alone))
+    });
+    println!("{tries:#?}");
+    assert!(right, "{tries:#?}");
     // Four times as many vertices and twice the modes take at least three times as long.
     let (fine, finer) = (folder.file("fine.msh"), folder.file("fine.modal"));
     succeeds(&["mesh", "bar", "--cells", "16,4,4", "--size", "1,0.2,0.2", "-o", &fine]);
