@@ -421,7 +421,7 @@ const WORDS: [(&str, &str, &str, Axes, &str); 6] = [
         "playout delay on the paper's worst network",
         "playout delay, ticks",
         Axes::LogarithmicError,
-        "What a longer playout delay buys on the paper's worst network: each way with the most repeats that are tried and the blend that is best for it at that delay. A point is the worst of the sessions of the search. Once a tick waits for longer than a round trip, what was lost arrives in time, and all that repair is right. So the smallest error is at a long delay, and a longer delay is what it costs.",
+        "What a longer playout delay buys on the paper's worst network: each way with the most repeats that are tried and the blend that is best for it at that delay. A point is the worst of the sessions of the search. Once a tick waits for enough repeats, or for a round trip, what was lost arrives in time, and all ways are right. So the smallest error is at a long delay, and the delay is what it costs.",
     ),
     (
         "f-network-delay-bursts",
