@@ -87,7 +87,7 @@ fn says_range(name: &str, before: &str, [least, most]: [f64; 2]) {
     says(name, &format!("{before} {told} to"), most);
 }
 
-const MEASUREMENTS: &str = "docs/measurements.md";
+const MEASUREMENTS: &str = "docs/report/measurements.md";
 const DECISIONS: &str = "docs/decisions.md";
 const LIMITS: &str = "docs/limits.md";
 const REPORT: &str = "docs/report/report.md";
@@ -196,6 +196,7 @@ fn the_elasticities_are_those_of_the_report() {
     says(DECISIONS, "with the patch's own shapes is off by 0.1 and", best(&far));
     let times = near.last().unwrap().0 / at("linear", 8).last().unwrap().0;
     says(DECISIONS, "with 36 coordinates at some", times);
+    says("docs/performance.md", "A step of it, held by a hand, costs some", times);
 }
 
 #[test]
@@ -299,6 +300,19 @@ fn ways_of_repair_are_told_as_they_were_measured() {
     }
     let bytes = |way| of(equal, nearest, way, 11);
     assert!((1.8..2.3).contains(&(bytes("paper") / bytes("default"))), "twice the bytes");
+}
+
+#[test]
+fn the_stability_matrix_is_told_as_its_page_counts_it() {
+    let all = row("docs/report/stability.md", "| all |");
+    let [cases, kept, limits, dynamics] = [1, 2, 3, 4].map(|cell| number(&all[cell]).0);
+    assert_eq!(cases, kept + limits);
+    says(DECISIONS, "The stability matrix has", cases);
+    says(DECISIONS, &format!("The stability matrix has {cases} cases and"), limits);
+    says(DECISIONS, &format!("cases and {limits} known limits.**"), kept);
+    says(MEASUREMENTS, "`pliant stability` runs", cases);
+    says(MEASUREMENTS, "of the cases state these:", dynamics);
+    says(MEASUREMENTS, "within 1e-9 of Coulomb's law. The", limits);
 }
 
 #[test]

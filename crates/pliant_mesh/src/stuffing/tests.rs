@@ -295,7 +295,7 @@ fn filled_thin(name: &str, surface: &Surface, target: usize) -> TetMesh {
     let seconds = start.elapsed().as_secs_f64();
     let lost = 1.0 - mesh.volume() / surface.volume();
     let quality = mesh.quality();
-    // The rows of docs/measurements.md.
+    // The rows of docs/report/measurements.md.
     println!(
         "{name}: lost {:.2} %, between {:.1} %, {:.1} to {:.1} degrees, {seconds:.1} s",
         100.0 * lost,
