@@ -196,7 +196,11 @@ def mujoco_flex(cells, beside, rounds):
             mujoco.mj_step(model, data)
         if unstable():
             continue
-        went, pairs = settle(lambda: mujoco.mj_step(model, data), lambda: (data.flexvert_xpos[end] - start[end]).mean(axis=0), per_second, beside, rounds)
+        try:
+            went, pairs = settle(lambda: mujoco.mj_step(model, data), lambda: (data.flexvert_xpos[end] - start[end]).mean(axis=0), per_second, beside, rounds)
+        except RuntimeError:
+            if not unstable():
+                raise
         if unstable():
             continue
         if np.abs(data.flexvert_xpos[held] - start[held]).max() > 1e-6:

@@ -275,7 +275,7 @@ def measure(pliant, folder, quick):
     def peer(name, work, kind, seconds, *jobs):
         """`work` gives a time for each of the jobs. `kind`: a step of ours, or with its surface."""
         try:
-            each = [(step()[kind], work()) for _ in range(rounds)]
+            each = [(step()[kind], within(LIMIT, work, folder)) for _ in range(rounds)]
             for i, (job, computes) in enumerate(jobs):
                 row(name, job, "us", computes, [(ours, its[i]) for ours, its in each], seconds)
         except Exception as error:  # a peer that is not there, or refuses, is told and the others go on
