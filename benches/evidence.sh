@@ -14,7 +14,7 @@
 set -uo pipefail
 cd "$(dirname "$0")/.." || exit 1
 
-models=../shared/models
+models=models
 parts=()
 while [ $# -gt 0 ]; do
     case "$1" in

@@ -136,10 +136,10 @@ if is_wanted blender; then
 fi
 
 # A recording in its viewer, short enough to be read before the picture is taken; on a busy machine
-# plots may be empty all the same, and it is made again. The window is at the corner of a larger
-# screen, so that the pointer, which is at its center, is not over it. The viewer that draws in
-# software may end with an error after it has written the picture, which has two pixels for each of
-# the window's.
+# plots may be empty all the same: look at it, and run this again. The window is at the corner of a
+# larger screen, so that the pointer, which is at its center, is not over it. The viewer that draws
+# in software may end with an error after it has written the picture, which has two pixels for each
+# of the window's.
 if is_wanted recording; then
     if command -v rerun >/dev/null && python3 -c 'import PIL' 2>/dev/null; then
         (cd "$work" && "$BIN/shared_body" --headless --seconds 20 --rerun out.rrd) \

@@ -384,7 +384,7 @@ impl Star {
             while guest.poll_event().is_some() {}
             let user = guest.user();
             assert!(guest.bodies().all(|view| view.visual().is_none_or(|shown| shown.is_finite())));
-            assert!(guest.rigids().all(|rigid| rigid.shown().is_valid()));
+            assert!(guest.rigids().all(|rigid| rigid.visual().is_valid()));
             let Some(view) = guest.body(BODY) else { continue };
             for grab in 0..4 {
                 let reaction = user.and_then(|user| view.hand_reaction(user, grab));

@@ -21,7 +21,7 @@ pub(crate) struct ReportArgs {
     quick: bool,
     /// Folder of the surfaces bunny.obj and armadillo.obj; the own body stands in for one that is
     /// missing
-    #[arg(long, value_name = "DIR", default_value = "../shared/models")]
+    #[arg(long, value_name = "DIR", default_value = "models")]
     models: PathBuf,
     /// The project's own body: a surface or a scene
     #[arg(long, value_name = "FILE", default_value = "assets/pip.ron")]

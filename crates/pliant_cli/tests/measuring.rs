@@ -4,6 +4,8 @@
 
 mod support;
 
+use std::sync::{Mutex, PoisonError};
+
 use support::{Folder, json, program, refused, succeeds};
 
 /// Makes a bar of linear elements and bakes 12 linear modes of it. Returns the paths of mesh
@@ -159,8 +161,8 @@ fn a_report_says_what_crosses_the_papers_networks() {
     }
 }
 
-/// Fastest of some thousand passes over as many bytes, GB/s: plain sums in the widest registers, and
-/// comparisons of two halves by the system's library.
+/// Fastest of some thousand passes over as many bytes, GB/s: plain sums in the widest registers,
+/// and comparisons of two halves by the system's library.
 fn reads_gb_s(bytes: usize) -> [f64; 2] {
     let fastest = |pass: &mut dyn FnMut()| {
         let mut us = f64::INFINITY;
@@ -183,8 +185,12 @@ fn reads_gb_s(bytes: usize) -> [f64; 2] {
     [sum, compared]
 }
 
+/// Held by what measures times and by what takes all cores for minutes.
+static CORES: Mutex<()> = Mutex::new(());
+
 #[test]
 fn a_body_is_timed_against_the_memory() {
+    let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = Folder::new("bench");
     let [mesh, model] = bar(&folder);
     let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
@@ -205,9 +211,9 @@ fn a_body_is_timed_against_the_memory() {
     let expected = told["bytes"].as_f64().unwrap() / median(&told, "reconstruct_us") * 1e-3;
     assert!((speed / expected - 1.0).abs() < 1e-9, "{speed} GB/s instead of {expected}");
     // The limit is that of this machine: the fastest sums of as many bytes in this process, which
-    // fit in a cache, are as fast. A frame is a step under a hand and a surface, and not one of them
-    // alone: without the surface it takes as long as a step. A core may change its speed between
-    // two timings, so that one of three runs has to be right.
+    // fit in a cache, are as fast. A frame is a step under a hand and a surface, and not one of
+    // them alone: without the surface it takes as long as a step. A core may change its speed
+    // between two timings, so that one of three runs has to be right.
     let mut tries = Vec::new();
     let right = (0..3).any(|_| {
         let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
@@ -219,7 +225,7 @@ fn a_body_is_timed_against_the_memory() {
             "limit {limit:.1} GB/s, by sums {here:.1} and by comparisons {compared:.1} here; a step of \
              {step:.2} us in a frame and of {alone:.2} us alone"
         ));
-        (0.75..1.1).contains(&(limit / here)) && (0.85..1.2).contains(&(step / alone))
+        (0.75..1.1).contains(&(limit / here)) && (0.6..1.5).contains(&(step / alone))
     });
     println!("{tries:#?}");
     assert!(right, "{tries:#?}");
@@ -358,19 +364,28 @@ struct Row {
     name: String,
     /// The third cell: a margin, or what a known limit measures.
     third: Option<f64>,
-    /// The number that the tightest bound measures.
-    measured: Option<f64>,
+    /// What the tightest bound is about, and the number that it measures.
+    bound: Option<(String, f64)>,
+    /// The fifth cell of a known limit's number: what it may be.
+    range: Option<[f64; 2]>,
 }
 
 impl Row {
     fn of(line: &str) -> Self {
         let cells: Vec<&str> = line.trim_matches('|').split(" | ").map(str::trim).collect();
         let number = |text: &str| text.trim_start_matches("> ").parse().ok();
-        let measured = |cell: &str| cell.split_once(" <= ")?.0.rsplit(' ').next().and_then(number);
+        let bound = |cell: &str| {
+            let (what, measured) = cell.split_once(" <= ")?.0.rsplit_once(' ')?;
+            Some((what.to_owned(), number(measured)?))
+        };
         Self {
             name: cells[0].to_owned(),
             third: cells.get(2).copied().and_then(number),
-            measured: cells.get(3).copied().and_then(measured),
+            bound: cells.get(3).copied().and_then(bound),
+            range: cells.get(4).and_then(|cell| {
+                let (low, high) = cell.split_once(" to ")?;
+                Some([low.parse().ok()?, high.parse().ok()?])
+            }),
         }
     }
 
@@ -379,8 +394,13 @@ impl Row {
         // Smaller numbers are rounding, or where a solver stops, and differ from processor to
         // processor.
         const ROUNDING: f64 = 1e-6;
-        let alike = match (self.measured, old.measured) {
-            (Some(now), Some(then)) if then < ROUNDING => now <= 100.0 * then + 1e-13,
+        if let (Some(now), Some([low, high])) = (self.third, old.range) {
+            return self.name == old.name && self.range == old.range && (low..=high).contains(&now);
+        }
+        let alike = match (&self.bound, &old.bound) {
+            // Another one may be the tightest where margins are nearly the same.
+            (Some(now), Some(then)) if now.0 != then.0 => self.third >= Some(1.0),
+            (Some(now), Some(then)) if then.1 < ROUNDING => now.1 <= 100.0 * then.1 + 1e-13,
             _ => match (self.third, old.third) {
                 (Some(now), Some(then)) => now == then || (0.8..=1.25).contains(&(now / then)),
                 (now, then) => now == then,
@@ -392,6 +412,7 @@ impl Row {
 
 #[test]
 fn the_stability_matrix_keeps_its_bounds_and_is_the_committed_page() {
+    let _cores = CORES.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = Folder::new("stability");
     let page = folder.file("stability.md");
     let told = json(&succeeds(&["stability", "--json", "-o", &page]));
@@ -425,6 +446,7 @@ fn the_stability_matrix_keeps_its_bounds_and_is_the_committed_page() {
     assert!(row("x 1.100e-1 <= 2.000e-1", "1.818").is_still(&told));
     assert!(row("x 9.0e-15 <= 1.0e-9", "111111").is_still(&row("x 1.0e-16 <= 1.0e-9", "> 1e6")));
     assert!(row("y 0.000e0 <= 1.0e-9", "> 1e6").is_still(&row("x 1.0e-16 <= 1.0e-9", "> 1e6")));
+    assert!(!row("y 2.0e-9 <= 1.0e-9", "0.5").is_still(&row("x 1.0e-16 <= 1.0e-9", "> 1e6")));
     // These are not, although each keeps its bound.
     for (now, then) in [
         (row("x 1.300e-1 <= 2.000e-1", "1.538"), told),

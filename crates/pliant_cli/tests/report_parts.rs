@@ -274,11 +274,11 @@ fn ways_of_repair_are_compared_alike_and_at_their_best() {
         assert!((row.3[delay] - default.3[delay]).abs() <= 2.0, "delays: {row:?}, {default:?}");
         // All guests send the same: targets, the clock and what they lack.
         assert!((back / default.3[up] - 1.0).abs() < 0.1 && back > 5.0 && back < sent, "{row:?}");
-        // The default is nearest to the true shape, or as near as the quanta and the tremor allow,
-        // but for the paper's ways in one step, of which one is nearer in two short sessions under a
-        // jitter of 30 ms.
+        // The default is nearest to the true shape in bursts. Elsewhere it is as near as the quanta
+        // and the tremor allow, and the paper's ways in one step come as near, or a little nearer.
         let more = if in_one.contains(&row.1.as_str()) { 1.3 } else { 1.05 };
-        assert!(default.3[median] < more * row.3[median] + 0.05, "{row:?}, {default:?}");
+        let quanta = if row.0.contains("bursts") { 0.0 } else { 0.003 };
+        assert!(default.3[median] < more * row.3[median] + quanta, "{row:?}, {default:?}");
     }
     let of = |rows: &[(String, String, String, Vec<f64>)], network: &str, way: &str| {
         rows.iter().find(|row| row.0 == network && row.1 == way).unwrap().3[median]

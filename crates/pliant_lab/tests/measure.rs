@@ -208,8 +208,8 @@ fn peers_see_one_shape_over_the_papers_worst_network() {
     // The own hand is felt in the next step. Its position is set every 5 ms, so that the oldest one
     // that a step of 25 ms answers is 20 ms old.
     assert!((15.0..=25.0).contains(&f.hand_to_force_ms), "{} ms", f.hand_to_force_ms);
-    // The path takes 98 ms, an application looks every 5 ms, and what is lost is repeated in the next
-    // datagrams.
+    // The path takes 98 ms, an application looks every 5 ms, and what is lost is repeated in the
+    // next datagrams.
     assert!((98.0..108.0).contains(&f.visual_delay_ms), "{} ms", f.visual_delay_ms);
     assert_eq!(f.hash, run_peers(&link, LateInputRepair::Rollback, 30.0).hash, "same seed, same session");
 }

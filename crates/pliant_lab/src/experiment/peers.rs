@@ -52,7 +52,7 @@ struct Session {
     /// Longest time from a position of the second peer's hand to a force that has it.
     answered: Duration,
     /// Mean age of what the second peer knows whole when it shows a step.
-    known: Duration,
+    known: Option<Duration>,
 }
 
 impl Experiment {
@@ -227,7 +227,8 @@ impl Experiment {
         }
         let link = &links[0][0];
         let (lost, hash) = (link.counts().lost, link.hash());
-        let known = ages / shown.max(1);
+        // A peer that never knows a whole tick has no such age.
+        let known = (shown > 0).then(|| ages / shown);
         Ok(Session { seen, agreed, lost, sent, hash, spent, answered, known })
     }
 
@@ -292,7 +293,7 @@ impl Experiment {
             / force_scale.max(1e-12);
         let own = self.hands.len() > 1;
         f.hand_to_force_ms = if own { session.answered.as_secs_f64() * 1e3 } else { f64::NAN };
-        f.visual_delay_ms = session.known.as_secs_f64() * 1e3;
+        f.visual_delay_ms = session.known.map_or(f64::NAN, |known| known.as_secs_f64() * 1e3);
         f.recover_ms = longest.as_secs_f64() * 1e3;
         let [down, up] = *sent;
         f.bytes_per_frame = down.1 as f64 / down.0.max(1) as f64;

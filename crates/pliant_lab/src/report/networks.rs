@@ -428,7 +428,7 @@ const WORDS: [(&str, &str, &str, Axes, &str); 6] = [
         "playout delay under bursts",
         "playout delay, ticks",
         Axes::LogarithmicError,
-        "The same with bursts of 4 ticks.",
+        "The same with bursts of 4 ticks. Here no delay that the library takes makes all ways right.",
     ),
 ];
 
@@ -439,7 +439,15 @@ fn tables(equal: &str, best: &str, grid: &Grid, seconds: f64, seeds: u64) -> Str
     format!(
         "All ways with a playout delay of {} tick and {} repeats (peers have no playout delay):\n\n{equal}\n\
          Each way with the playout delay ({}), the repeats ({}) and the blend (its own, {}) that give it the smallest error of the shape over this network, smaller ones where that costs less than a hundredth. The delay and the blend are chosen with the most repeats, and then the repeats. What counts is the worst of {search_seeds} sessions with the seeds from {SEARCH_SEED} on, and what is shown are sessions with others. The search is on the paper's networks, and on the worst one with jitter and bursts, not on the other networks with them. A delay of {last} ticks is the longest that the library takes, and 7 repeats are the most:\n\n{best}\n\
-         *rms* and *largest* are shares of the largest displacement, *rms / rms of the motion* is the error as a share of the rms of the true displacement, and so for the force. The true shape has all modes, and shapes are compared at some 48 vertices of the surface. A tick that is not shown in time counts with the picture and the forces that are shown instead, and a force that is not shown counts as zero. The hands have a tremor of 9.3 and 11.7 Hz, which nothing can predict; two columns are without it. The *shown delay* is from the host's step to the showing of its tick. Peers show their own step at once, before they know all targets: theirs is the age of the newest tick whose targets the second peer knows, from the first peer's step on, which is how late it sees the other's hand right. They are compared with what all agree on under rollback; so is compensation, which leaves each peer with a state of its own. `none` and the paper's policies stream accelerations, with average acceleration at both ends as in the paper. Jitter is an extra delay with an exponential distribution of this mean, and may change the order. Bursts are those of a Gilbert-Elliott path that loses as much as the network does; the last network loses nothing and has none. Each run is {seconds:.0} s of a session of two hands at the host, between peers one at each. *Down* and *up* are all datagrams of the session, without those of UDP and QUIC, with the same hands: of two hands, the host or the first peer has one and the guest or the second peer the other. Frames have both hands whoever has them, and what a guest sends is measured in a session in which it holds the body. Peers send only targets, down what the first sends and up what the second sends. The last three columns are of {seeds} seeds of the network, the first of which is that of all other columns.\n",
+         - *rms* and *largest* are shares of the largest displacement, *rms / rms of the motion* is the error as a share of the rms of the true displacement, and so for the force. The true shape has all modes, and shapes are compared at some 48 vertices of the surface.\n\
+         - A tick that is not shown in time counts with the picture and the forces that are shown instead, and a force that is not shown counts as zero.\n\
+         - The hands have a tremor of 9.3 and 11.7 Hz, which nothing can predict; two columns are without it.\n\
+         - The *shown delay* is from the host's step to the showing of its tick. Peers show their own step at once, before they know all targets: theirs is the age of the newest tick whose targets the second peer knows, from the first peer's step on, which is how late it sees the other's hand right.\n\
+         - They are compared with what all agree on under rollback; so is compensation, which leaves each peer with a state of its own.\n\
+         - `none` and the paper's policies stream accelerations, with average acceleration at both ends as in the paper.\n\
+         - Jitter is an extra delay with an exponential distribution of this mean, and may change the order. Bursts are those of a Gilbert-Elliott path that loses as much as the network does; the last network loses nothing and has none. Each run is {seconds:.0} s of a session of two hands at the host, between peers one at each.\n\
+         - *Down* and *up* are all datagrams of the session, without those of UDP and QUIC, with the same hands: of two hands, the host or the first peer has one and the guest or the second peer the other. Frames have both hands whoever has them, and what a guest sends is measured in a session in which it holds the body. Peers send only targets, down what the first sends and up what the second sends.\n\
+         - The last three columns are of {seeds} seeds of the network, the first of which is that of all other columns.\n",
         EQUAL.0,
         EQUAL.1,
         list(delays),

@@ -13,8 +13,8 @@ use super::{
 };
 use crate::LabError;
 
-/// Largest allowed excursion of a dragged patch, as a multiple of the drag: a spring without damping
-/// that is jerked overshoots by as much as it is led, and no more.
+/// Largest allowed excursion of a dragged patch, as a multiple of the drag: a spring without
+/// damping that is jerked overshoots by as much as it is led, and no more.
 const EXCURSION: f64 = 2.0;
 
 /// Largest allowed difference of a held reaction from the static one, as a share of it. A bar a

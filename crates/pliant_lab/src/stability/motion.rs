@@ -13,8 +13,8 @@ use super::{
 };
 use crate::LabError;
 
-/// What rounding may add in 100,000 steps, as a share, if it always adds: a spacing of numbers near 1
-/// in each.
+/// What rounding may add in 100,000 steps, as a share, if it always adds: a spacing of numbers near
+/// 1 in each.
 const DRIFT: f64 = 1e5 * f64::EPSILON;
 
 const FAR_AND_FAST: &str = "the held patch is lengths away from its rest: a pull there turns the warp's rows within a step of 1/60 s, and its work over the step is not what it was taken to be; at 1/240 s, or without the warp, the same start is quiet";
@@ -98,7 +98,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 /// The known result at 1/60 s of a held start whose patch is lengths away from its rest: the body
 /// is not at rest at the end.
 fn far_and_fast(shape: [f64; 3]) -> Option<Expected> {
-    let unrest = Expected::Measured(&[("kinetic energy at the end / energy at the start", 0.05, 0.09)]);
+    let unrest = Expected::Measured(&[("kinetic energy at the end / energy at the start", 0.02, 0.2)]);
     (shape[0] > 1.0).then_some(unrest)
 }
 

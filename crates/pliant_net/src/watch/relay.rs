@@ -137,8 +137,8 @@ impl Relay {
         without_token(self.url.as_str())
     }
 
-    /// Keeps a client connected, and calls `on_change` at each connection, and with the reason at each
-    /// loss and failure.
+    /// Keeps a client connected, and calls `on_change` at each connection, and with the reason at
+    /// each loss and failure.
     pub(super) async fn keep(&self, client: moq_net::Client, on_change: impl Fn(Result<(), String>)) {
         let mut pause = PAUSES[0];
         // Each reason once, and at most two in a row that alternate.
