@@ -275,10 +275,15 @@ fn ways_of_repair_are_compared_alike_and_at_their_best() {
         // All guests send the same: targets, the clock and what they lack.
         assert!((back / default.3[up] - 1.0).abs() < 0.1 && back > 5.0 && back < sent, "{row:?}");
         // The default is nearest to the true shape in bursts. Elsewhere it is as near as the quanta
-        // and the tremor allow, and the paper's ways in one step come as near, or a little nearer.
+        // and the tremor allow, and the paper's ways in one step come as near, or a little nearer:
+        // in two short sessions under jitter, by some hundredths of a percent.
         let more = if in_one.contains(&row.1.as_str()) { 1.3 } else { 1.05 };
-        let quanta = if row.0.contains("bursts") { 0.0 } else { 0.003 };
-        assert!(default.3[median] < more * row.3[median] + quanta, "{row:?}, {default:?}");
+        let slack = match (row.0.contains("bursts"), row.0.contains("jitter")) {
+            (true, _) => 0.0,
+            (_, true) => 0.05,
+            _ => 0.003,
+        };
+        assert!(default.3[median] < more * row.3[median] + slack, "{row:?}, {default:?}");
     }
     let of = |rows: &[(String, String, String, Vec<f64>)], network: &str, way: &str| {
         rows.iter().find(|row| row.0 == network && row.1 == way).unwrap().3[median]
