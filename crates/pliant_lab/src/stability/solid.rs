@@ -209,6 +209,8 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
+
     use super::{super::bodies::BarBody, *};
 
     /// The force at the end of a bar 10 : 1 over that of Timoshenko's beam.
