@@ -66,8 +66,8 @@ def page(errors, speeds, name, rounds, made, load, versions):
         f"[{name}-times.csv]({name}-times.csv).",
         f"- The hanging bar has E {hang.YOUNG:g} Pa, nu {hang.POISSON:g} and {hang.DENSITY:g} kg/m^3 under {hang.GRAVITY:g} m/s^2. By the elastica its end is {-down:.4f} m lower and {-along:.4f} m nearer "
         f"to the wall. The free bar has E {times.YOUNG:g} Pa, nu {times.POISSON:g} and {times.DENSITY:g} kg/m^3.",
-        f"- All programs have the same grids. MuJoCo cuts the cells of a grid into tetrahedra in its own way. A row of the first table, and a round of the second, is ended "
-        f"after {LIMIT} s, and the table says so. An error that is larger on a finer mesh says that the smaller one is where a program crosses the solution, and not that it converges.",
+        f"- All programs have the same grids. MuJoCo cuts the cells of a grid into tetrahedra in its own way. A row of the first table, and one of the eigensolvers, is "
+        f"ended after {LIMIT} s, and the table says so. An error that is larger on a finer mesh says that the smaller one is where a program crosses the solution, and not that it converges.",
         "- Steps of the hanging bar: Pliant's are 1/60 s, with a hand and without writing the surface. MuJoCo's are the longest of 1/120 s and its halves at which it is stable, with its integrator "
         "`discrete`. PyBullet's are 1/1000 s, and Rapier's and Exudyn's 1/240 s, as chosen here. Positions of all nodes are part of the times of MuJoCo, PyBullet and Rapier, and so are their collision "
         "worlds without contacts. MuJoCo warns at every step that its matrix is nearly singular, and comes to rest all the same.",

@@ -385,7 +385,7 @@ fn other_programs_take_as_long_as_was_measured() {
         range(&rows.iter().filter(|row| wanted(&row.0)).map(|row| row.1).collect::<Vec<_>>())
     };
     let times = table("peers-times", "ratio_median");
-    for name in ["SciPy", "MuJoCo", "Exudyn", "Rapier"] {
+    for name in ["SciPy", "PyBullet", "MuJoCo", "Exudyn", "Rapier"] {
         assert!(times.iter().any(|row| row.0.starts_with(name)), "{name} was not measured");
     }
     let steps = of(&times, &|name| !name.starts_with("SciPy"));
