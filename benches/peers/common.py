@@ -62,6 +62,25 @@ def same_frequencies(ours, theirs):
     return off
 
 
+def write_vtk(path, points, tets):
+    """A legacy ASCII file of tetrahedra, as PyBullet reads it."""
+    lines = ["# vtk DataFile Version 2.0", "bar", "ASCII", "DATASET UNSTRUCTURED_GRID", f"POINTS {len(points)} double"]
+    lines += [" ".join(map(repr, map(float, p))) for p in points]
+    lines += [f"CELLS {len(tets)} {5 * len(tets)}"] + ["4 " + " ".join(map(str, t)) for t in tets]
+    lines += [f"CELL_TYPES {len(tets)}"] + ["10"] * len(tets)
+    path.write_text("\n".join(lines) + "\n")
+
+
+def exudyn_settings(exudyn, steps, step):
+    """For so many steps (s) on one thread. Its own advice for speed is that the Jacobian is kept as long as Newton converges."""
+    settings = exudyn.SimulationSettings()
+    settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = steps, steps * step
+    settings.timeIntegration.verboseMode, settings.solutionSettings.writeSolutionToFile = 0, False
+    settings.timeIntegration.newton.useModifiedNewton = True
+    settings.parallel.numberOfThreads = 1
+    return settings
+
+
 def within(seconds, work, folder):
     """What `work` returns, in a process of its own that ends when the time is over."""
     ours, its = multiprocessing.Pipe(False)

@@ -10,7 +10,7 @@ of motion, one thread each. Rounds are by turns with one row of ours. `run.py` c
 
 import json, pathlib, sys, tempfile, time, warnings
 
-from common import LIMIT, ROUNDS, figure, ratios, same_frequencies, within
+from common import LIMIT, ROUNDS, exudyn_settings, figure, ratios, same_frequencies, within, write_vtk
 
 import numpy as np
 from scipy.integrate import solve_bvp
@@ -214,11 +214,7 @@ def bullet(cells, folder, beside, rounds):
 
     points, tets = grid(cells)
     path = folder / "bullet.vtk"
-    lines = ["# vtk DataFile Version 2.0", "bar", "ASCII", "DATASET UNSTRUCTURED_GRID", f"POINTS {len(points)} double"]
-    lines += [" ".join(map(repr, map(float, p))) for p in points]
-    lines += [f"CELLS {len(tets)} {5 * len(tets)}"] + ["4 " + " ".join(map(str, t)) for t in tets]
-    lines += [f"CELL_TYPES {len(tets)}"] + ["10"] * len(tets)
-    path.write_text("\n".join(lines) + "\n")
+    write_vtk(path, points, tets)
     step = 1 / 1000
     pybullet.connect(pybullet.DIRECT)
     try:
@@ -286,11 +282,7 @@ def exudyn_floating_frame(pliant, cells, element, modes, folder, beside, rounds)
             frame = system.AddMarker(item.MarkerNodeRigid(nodeNumber=made["nRigidBody"]))
             system.AddObject(item.GenericJoint(markerNumbers=[ground, frame], constrainedAxes=[1] * 6))
             system.Assemble()
-            settings = exudyn.SimulationSettings()
-            settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = steps, steps * step
-            settings.timeIntegration.verboseMode, settings.solutionSettings.writeSolutionToFile = 0, False
-            settings.timeIntegration.newton.useModifiedNewton = True
-            settings.parallel.numberOfThreads = 1
+            settings = exudyn_settings(exudyn, steps, step)
             began = time.perf_counter()
             if not system.SolveDynamic(settings):
                 raise RuntimeError("its solver gave up")

@@ -9,7 +9,7 @@ calls this.
 
 import json, struct, sys, time, warnings
 
-from common import LIMIT, ROUNDS, TooLong, figure, ratios, same_frequencies, within
+from common import LIMIT, ROUNDS, TooLong, exudyn_settings, figure, ratios, same_frequencies, within, write_vtk
 
 import numpy as np
 from scipy.io import mmread
@@ -90,11 +90,7 @@ def bullet(folder, values, vectors, nodal_mass):
     points, tets = read_vtk(folder / "bar.vtk")
     place = folder / "bullet"
     place.mkdir(exist_ok=True)
-    lines = ["# vtk DataFile Version 2.0", "bar", "ASCII", "DATASET UNSTRUCTURED_GRID", f"POINTS {len(points)} double"]
-    lines += [" ".join(map(repr, map(float, p))) for p in points]
-    lines += [f"CELLS {len(tets)} {5 * len(tets)}"] + ["4 " + " ".join(map(str, t)) for t in tets]
-    lines += [f"CELL_TYPES {len(tets)}"] + ["10"] * len(tets)
-    (place / "bar.vtk").write_text("\n".join(lines) + "\n")
+    write_vtk(place / "bar.vtk", points, tets)
 
     def numbers(name, array):
         flat = np.ascontiguousarray(array, dtype="<f8").ravel()
@@ -183,12 +179,7 @@ def exudyn_floating_frame(folder, values, vectors):
             marker = system.AddMarker(item.MarkerSuperElementPosition(bodyNumber=made["oFFRFreducedOrder"], meshNodeNumbers=inner, weightingFactors=[0.25] * 4))
             system.AddLoad(item.LoadForceVector(markerNumber=marker, loadVector=[force, 0, 0]))
             system.Assemble()
-            settings = exudyn.SimulationSettings()
-            settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = steps, steps * step
-            settings.timeIntegration.verboseMode, settings.solutionSettings.writeSolutionToFile = 0, False
-            # Its own advice for speed: the Jacobian is kept as long as Newton converges.
-            settings.timeIntegration.newton.useModifiedNewton = True
-            settings.parallel.numberOfThreads = 1
+            settings = exudyn_settings(exudyn, steps, step)
             began = time.perf_counter()
             solved = system.SolveDynamic(settings)
         seconds = time.perf_counter() - began

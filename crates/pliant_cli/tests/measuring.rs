@@ -398,9 +398,11 @@ impl Row {
             return self.name == old.name && self.range == old.range && (low..=high).contains(&now);
         }
         let alike = match (&self.bound, &old.bound) {
-            // Another one may be the tightest where margins are nearly the same.
-            (Some(now), Some(then)) if now.0 != then.0 => self.third >= Some(1.0),
-            (Some(now), Some(then)) if then.1 < ROUNDING => now.1 <= 100.0 * then.1 + 1e-13,
+            (Some(now), Some(then)) if now.0 == then.0 && then.1 < ROUNDING => {
+                now.1 <= 100.0 * then.1 + 1e-13
+            }
+            // Of two that are rounding, either may be the tightest.
+            (Some(now), Some(then)) if now.1.max(then.1) < ROUNDING => self.third >= Some(1.0),
             _ => match (self.third, old.third) {
                 (Some(now), Some(then)) => now == then || (0.8..=1.25).contains(&(now / then)),
                 (now, then) => now == then,

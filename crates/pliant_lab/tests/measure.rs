@@ -44,20 +44,12 @@ struct Condition {
     many: Bars,
     /// For the shape's error in the median one of them, rms %, and for the ticks that come too late
     /// in a mean one. These do not depend on the number of sessions.
-    median: f64,
-    mean_too_late: f64,
+    typical: [f64; 2],
 }
 
 fn conditions() -> [Condition; 4] {
     let bars = |rms, max, reactions, ringing, too_late| Bars { rms, max, reactions, ringing, too_late };
-    let of = |name, link, minute, many, [median, mean_too_late]: [f64; 2]| Condition {
-        name,
-        link,
-        minute,
-        many,
-        median,
-        mean_too_late,
-    };
+    let of = |name, link, minute, many, typical| Condition { name, link, minute, many, typical };
     let tick = Duration::from_millis(25);
     [
         of(
@@ -373,7 +365,9 @@ fn default_policy_holds_its_bars_for_ten_minutes_on_many_seeds() {
         );
     };
     let mut missed = Vec::new();
-    for Condition { name, link, many: bars, median, mean_too_late, .. } in conditions() {
+    for Condition { name, link, many: bars, typical: [median, mean_too_late], .. } in conditions() {
+        // The rarest blackout of a hundred sessions is not among twenty.
+        let bars = if seeds <= 20 { Bars { max: bars.max.min(45.0), ..bars } } else { bars };
         // Losses that are scheduled are the same in every session.
         let seeds = match link.loss {
             Loss::Random(_) | Loss::GilbertElliott { .. } => seeds,

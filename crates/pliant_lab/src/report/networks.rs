@@ -239,7 +239,10 @@ impl Grid {
             let all: Vec<Experiment> =
                 tried.iter().flat_map(|s| with_seeds(made(*s), SEARCH_SEED, self.seeds)).collect();
             let all = run_all(scheme, &all)?;
-            let worst = |f: &[Metrics]| f.iter().map(|f| f.rms_of_motion_percent).fold(0.0, f64::max);
+            // What is no number is the worst.
+            let error = |f: &Metrics| Some(f.rms_of_motion_percent).filter(|e| e.is_finite());
+            let worst =
+                |f: &[Metrics]| f.iter().map(|f| error(f).unwrap_or(f64::INFINITY)).fold(0.0, f64::max);
             Ok(all.chunks(self.seeds as usize).map(worst).collect())
         };
         // The first settings that are within a hundredth of the best.
