@@ -27,8 +27,8 @@ pub(super) struct BarBody {
     pub(super) density: f64,
     /// Fraction of critical damping.
     pub(super) zeta: f64,
-    /// Held at x = 0 if true, free otherwise.
-    pub(super) held: bool,
+    /// Share of the length from x = 0 that is held. `None`: the body is free.
+    pub(super) held: Option<f64>,
     /// Sites at which flexibilities are baked. `None`: as the bake has it.
     pub(super) sites: Option<usize>,
     /// Material for large strains. The modes are then coordinates.
@@ -47,7 +47,7 @@ impl Default for BarBody {
             poisson: 0.4,
             density: 1000.0,
             zeta: 0.03,
-            held: true,
+            held: Some(1e-9),
             sites: Some(48),
             material: None,
         }
@@ -68,11 +68,7 @@ impl BarBody {
     }
 
     pub(super) fn bake_mesh(&self, mesh: &TetMesh) -> Result<Arc<ModalModel>, LabError> {
-        let anchors = if self.held {
-            vec![Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 * self.length }]
-        } else {
-            Vec::new()
-        };
+        let anchor = |share| Anchor { axis: 0, comparison: Comparison::Less, bound: share * self.length };
         let config = BakeConfig {
             element: self.element,
             modes: self.modes,
@@ -81,7 +77,7 @@ impl BarBody {
             poisson: self.poisson,
             density: self.density,
             damping: Damping::Ratio(self.zeta),
-            anchors,
+            anchors: self.held.map(anchor).into_iter().collect(),
             sites: self.sites,
             ..BakeConfig::default()
         };

@@ -64,7 +64,7 @@ fn block(young: f64, zeta: f64, elasticity: Elasticity) -> BarBody {
         modes: 24,
         young,
         zeta,
-        held: false,
+        held: None,
         material: (elasticity == Elasticity::Reduced).then_some(Material::NeoHookean),
         ..BarBody::default()
     }

@@ -375,7 +375,7 @@ fn many(modes: usize, hands: usize) -> Result<CaseOutcome, LabError> {
 
 /// Pulls a free body to and fro. The cases have masses a million times apart under the same hand.
 fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<CaseOutcome, LabError> {
-    let bar = BarBody { held: false, density, modes: 12, zeta: 0.1, ..BarBody::default() };
+    let bar = BarBody { held: None, density, modes: 12, zeta: 0.1, ..BarBody::default() };
     let model = bar.bake()?;
     let patch = bar.tip(&model)?;
     let hand = GrabConfig { stiffness, relaxation: 1.0 / 60.0 };

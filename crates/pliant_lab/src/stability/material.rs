@@ -1,9 +1,11 @@
 //! Material and mesh of a body: stiffness, Poisson ratio, density, damping, size, element shape and
 //! number of modes.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
-use pliant_mesh::TetMesh;
-use pliant_modal::{BodyConfig, Element, GrabConfig, Integrator, Patch, StepSettings};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{Body, BodyConfig, Element, GrabConfig, Integrator, ModalModel, StepSettings};
 
 use super::{
     Bound, Case, CaseOutcome, Expected,
@@ -146,6 +148,56 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             struck(&struck_one, 1.0 / 60.0, Integrator::Exact)
         }));
     }
+    for (name, bar, mesh) in forms() {
+        for step in [1e-3, 1.0 / 60.0] {
+            let bar = bar.clone();
+            out.push(Case::new("form", format!("{name}, h {step:.4} s, dragged"), move || {
+                let config = BodyConfig { step, ..BodyConfig::default() };
+                drag_model(&bar, bar.bake_mesh(&mesh(&bar)?)?, config)
+            }));
+        }
+        let bar = BarBody { zeta: 0.0, ..bar };
+        out.push(Case::new("form", format!("{name}, struck without damping"), move || {
+            struck_model(&bar, bar.bake_mesh(&mesh(&bar)?)?, 1.0 / 60.0, Integrator::Exact)
+        }));
+    }
+}
+
+type Form = (&'static str, BarBody, fn(&BarBody) -> Result<TetMesh, LabError>);
+
+/// Bodies that move otherwise than a bar of equal cells: names and meshes.
+fn forms() -> [Form; 8] {
+    let bar = BarBody::default;
+    [
+        ("needles, edges 10 : 1", BarBody { cells: [4, 4, 4], section: [0.1, 0.1], ..bar() }, BarBody::mesh),
+        (
+            "a plate, edges 10 : 1",
+            BarBody { cells: [4, 4, 1], section: [1.0, 0.025], ..bar() },
+            BarBody::mesh,
+        ),
+        (
+            "plates across, edges 40 : 1",
+            BarBody { cells: [40, 1, 1], section: [1.0, 1.0], ..bar() },
+            BarBody::mesh,
+        ),
+        ("slivers, a thousandth of the height", bar(), |bar| Ok(slivers(bar.mesh()?, 0.999))),
+        ("slices 1e4 : 1", bar(), |bar| graded(bar, 1e4)),
+        ("a cube", BarBody { cells: [4, 4, 4], section: [1.0, 1.0], ..bar() }, BarBody::mesh),
+        ("a ball on a cap", BarBody { section: [1.0, 1.0], held: Some(0.15), ..bar() }, |bar| {
+            let mut mesh = shapes::sphere(5, 0.5 * bar.length)?;
+            mesh.nodes.iter_mut().flatten().for_each(|x| *x += 0.5 * bar.length);
+            Ok(mesh)
+        }),
+        ("a hook of a quarter of a circle", BarBody { cells: [12, 2, 2], ..bar() }, |bar| {
+            let mut mesh = bar.mesh()?;
+            for node in &mut mesh.nodes {
+                let (sin, cos) = (node[0] / bar.length * std::f64::consts::FRAC_PI_2).sin_cos();
+                let radius = bar.length * std::f64::consts::FRAC_2_PI - node[1];
+                *node = [radius * sin, bar.length * std::f64::consts::FRAC_2_PI - radius * cos, node[2]];
+            }
+            Ok(mesh)
+        }),
+    ]
 }
 
 /// A case with a mesh of thin elements. `refused` is true if the elements are so thin that the bake
@@ -175,8 +227,14 @@ pub(super) fn word(integrator: Integrator) -> &'static str {
 /// it for as long. The force must not ring. A body far slower than the step is still moving, so its
 /// bound is looser.
 fn drag(bar: &BarBody, config: BodyConfig) -> Result<CaseOutcome, LabError> {
+    drag_model(bar, bar.bake()?, config)
+}
+
+/// [`drag`] with the model of another mesh.
+fn drag_model(bar: &BarBody, model: Arc<ModalModel>, config: BodyConfig) -> Result<CaseOutcome, LabError> {
     let step = config.step;
-    let mut held = HeldCase::new(bar, config, GrabConfig::default())?;
+    let patch = bar.tip(&model)?;
+    let mut held = HeldCase::of(model, patch, config, GrabConfig::default())?;
     let seconds = (40.0 * step).max(1.0);
     let steps = (2.0 * seconds / step) as usize;
     let reach = 0.05 * bar.length;
@@ -237,19 +295,20 @@ fn hold_mesh(bar: &BarBody, mesh: &TetMesh, step: f64, full: bool) -> Result<Cas
 
 /// Applies an impulse at the tip and runs 5,000 free steps. The energy must never grow.
 fn struck(bar: &BarBody, step: f64, integrator: Integrator) -> Result<CaseOutcome, LabError> {
-    let held = HeldCase::new(
-        bar,
-        BodyConfig {
-            step,
-            settings: StepSettings { integrator, ..Default::default() },
-            ..BodyConfig::default()
-        },
-        GrabConfig::default(),
-    )?;
-    let mut body = held.body;
-    body.release(held.grab);
-    let impulse = 0.05 * bar.length * held.model.omega()[0] * held.model.mass();
-    body.apply_impulse(Patch::center(&held.patch), [0.3 * impulse, impulse, -0.7 * impulse])?;
+    struck_model(bar, bar.bake()?, step, integrator)
+}
+
+/// [`struck`] with the model of another mesh.
+fn struck_model(
+    bar: &BarBody,
+    model: Arc<ModalModel>,
+    step: f64,
+    integrator: Integrator,
+) -> Result<CaseOutcome, LabError> {
+    let settings = StepSettings { integrator, ..Default::default() };
+    let mut body = Body::new(model.clone(), BodyConfig { step, settings, ..BodyConfig::default() })?;
+    let impulse = 0.05 * bar.length * model.omega()[0] * model.mass();
+    body.apply_impulse(bar.tip(&model)?.center(), [0.3 * impulse, impulse, -0.7 * impulse])?;
     // Generalized-alpha damps fast modes in a norm of its own that equals the energy within a
     // factor.
     if matches!(integrator, Integrator::GeneralizedAlpha { .. }) {

@@ -152,7 +152,7 @@ fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<CaseOut
 }
 
 fn free(young: f64) -> BarBody {
-    BarBody { held: false, young, modes: 12, zeta: 0.01, ..BarBody::default() }
+    BarBody { held: None, young, modes: 12, zeta: 0.01, ..BarBody::default() }
 }
 
 fn flight(step: f64) -> Result<CaseOutcome, LabError> {

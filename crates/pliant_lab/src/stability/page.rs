@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::{StabilityReport, Verdict};
+use super::{Bound, StabilityReport, Verdict};
 
 /// The text above the stamp.
 const HEAD: &str = "\
@@ -10,12 +10,13 @@ const HEAD: &str = "\
 
 `pliant stability -o docs/report/stability.md` makes this page. A bound compares a measured number
 with a limit. The margin is the limit over the number, for the tightest bound of a case: with 1 the
-bound just holds. The phases are those of the slowest and the fastest mode in a step, and zeta is
-the damping ratio of these (one number where both have the same). Stiffness, density, size and step
-act on the motion through phases, damping ratios and relaxation alone, so that two cases of one
-script that have these alike are one case for the arithmetic, in other units. The column of dynamics
-counts those that differ. Numbers far below 1e-9 are rounding, and differ from processor to
-processor. A tool at 0 m/s is held by the friction of its device, 0.26 N as in a Touch.
+bound just holds. A second table has every bound, with the case that keeps it most narrowly. The
+phases are those of the slowest and the fastest mode in a step, and zeta is the damping ratio of
+these (one number where both have the same). Stiffness, density, size and step act on the motion
+through phases, damping ratios and relaxation alone, so that two cases of one script that have these
+alike are one case for the arithmetic, in other units. The column of dynamics counts those that
+differ. Numbers far below 1e-9 are rounding, and differ from processor to processor. A tool at 0 m/s
+is held by the friction of its device, 0.26 N as in a Touch.
 
 ";
 
@@ -51,6 +52,7 @@ impl StabilityReport {
             row(&mut page, group, of(group).collect());
         }
         row(&mut page, "all", self.cases.iter().collect());
+        self.bounds(&mut page);
         page += "\n## Known limits\n\nA known limit breaks a bound for a reason. It passes if each number that breaks its bound is\nwithin its range, and all others keep theirs. Any other result fails, a better one too.\n";
         let mut reasons: Vec<&'static str> = Vec::new();
         for why in self.cases.iter().filter_map(|case| case.known_limit) {
@@ -109,6 +111,39 @@ impl StabilityReport {
             }
         }
         page
+    }
+
+    /// Every bound with the case that keeps it with the smallest margin.
+    fn bounds(&self, page: &mut String) {
+        *page += "\n## Bounds\n\n| bound | cases | smallest margin | of | in | limits |\n";
+        *page += "| --- | --- | --- | --- | --- | --- |\n";
+        let all = || self.cases.iter().flat_map(|case| case.bounds.iter().map(move |bound| (case, bound)));
+        let mut names: Vec<&'static str> = Vec::new();
+        for (_, bound) in all() {
+            if !names.contains(&bound.what) {
+                names.push(bound.what);
+            }
+        }
+        for name in names {
+            let of = || all().filter(|(_, bound)| bound.what == name);
+            let kept = |bound: &Bound| bound.margin() >= 1.0;
+            let nearest =
+                of().filter(|(_, bound)| kept(bound)).min_by(|a, b| a.1.margin().total_cmp(&b.1.margin()));
+            let limits = of().map(|(_, bound)| bound.limit);
+            let (least, most) = (limits.clone().fold(f64::INFINITY, f64::min), limits.fold(0.0, f64::max));
+            let limits =
+                if least == most { format!("{least:.3e}") } else { format!("{least:.3e} to {most:.3e}") };
+            let what = name.replace('|', "\\|");
+            let nearest = nearest.map_or_else(
+                || "- | - | none keeps it".to_owned(),
+                |(case, bound)| {
+                    let (margin, got, limit) = (margin(bound.margin()), bound.measured, bound.limit);
+                    format!("{margin} | measured {got:.3e} <= {limit:.3e} | {}, {}", case.group, case.name)
+                },
+            );
+            // Writing to a string cannot fail.
+            let _ = writeln!(page, "| {what} | {} | {nearest} | {limits} |", of().count());
+        }
     }
 }
 

@@ -70,7 +70,7 @@ fn bar(material: Material, young: f64, held: bool) -> BarBody {
         section: [0.3, 0.3],
         modes: 24,
         young,
-        held,
+        held: held.then_some(1e-9),
         material: Some(material),
         ..BarBody::default()
     }
