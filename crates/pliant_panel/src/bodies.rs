@@ -36,6 +36,8 @@ pub struct BodyView {
     pub energies: Trace,
     /// The hands on the body.
     pub hands: Vec<HandView>,
+    /// What the body touches. `None` if it has touched nothing.
+    pub contact: Option<ContactView>,
     /// Whether the body's header is closed, so that the fields shown below the header need not be
     /// filled in. [`show`] sets this for the next frame. A body that is folded when it is first
     /// shown starts with a closed header.
@@ -58,6 +60,21 @@ pub struct HandView {
     /// Magnitude of the reaction, N.
     pub force: f64,
     /// Magnitude of the reaction over the last seconds, N.
+    pub forces: Trace,
+}
+
+/// What a body touches: floors, obstacles, other bodies.
+#[derive(Debug, Clone, Default)]
+pub struct ContactView {
+    /// Number of places where the body touches something.
+    pub places: usize,
+    /// Number of those places that slide.
+    pub sliding: usize,
+    /// Magnitude of the sum of the forces on the body, N.
+    pub force: f64,
+    /// Depth of the deepest place inside the other, m.
+    pub depth: f64,
+    /// Magnitude of the sum of the forces over the last seconds, N.
     pub forces: Trace,
 }
 
@@ -144,4 +161,13 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
         "N",
         hands.map(|(i, hand)| (hand.name.as_str(), &hand.forces, color_of(i, hand))),
     );
+    if let Some(contact) = &body.contact {
+        let ContactView { places, sliding, force, depth, forces } = contact;
+        let (force, depth) = (short(*force), short(1e3 * depth));
+        ui.label(format!(
+            "touches {places} places ({sliding} slide) \u{b7} {force} N \u{b7} {depth} mm deep"
+        ))
+        .on_hover_text("The sum of the forces on the body where it touches, and its deepest place.");
+        plot(ui, &format!("pliant contact {index}"), "N", [("contact", forces, color(1))]);
+    }
 }

@@ -277,6 +277,36 @@ fn a_recording_has_a_section_and_its_knobs_change_it() {
     assert!(now(&shown).stress);
 }
 
+#[cfg(feature = "contact")]
+#[test]
+fn a_ball_that_presses_a_body_is_told_with_its_force_and_when_it_has_gone() {
+    use pliant_contact::{BodyContacts, ContactPlugin, Obstacle};
+    let mut app = app(|app| {
+        app.add_plugins(ContactPlugin::default());
+    });
+    let entity = find::<BodyState>(&mut app).unwrap();
+    let surface = app.world().get::<BodyState>(entity).unwrap().model().surface();
+    let top = surface.positions().iter().copied().max_by(|a, b| a[1].total_cmp(&b[1])).unwrap();
+    let mut shown = show(app);
+    shown.run_steps(3);
+    assert!(shown.query_by_label_contains("touches").is_none());
+    let ball = Obstacle::Ball { radius: 0.05 };
+    let at = Transform::from_translation(Vec3::from(top) + Vec3::Y * 0.045);
+    let ball = shown.state_mut().world_mut().spawn((ball, at)).id();
+    until("the ball's force is told", || {
+        shown.run_steps(1);
+        let world = shown.state().world();
+        let force = world.get::<BodyContacts>(entity).map_or(0.0, |all| all.force().length());
+        let told = shown.query_by_label_contains("touches").is_some();
+        if told && force > 0.01 { Ok(()) } else { Err((told, force)) }
+    });
+    shown.state_mut().world_mut().despawn(ball);
+    until("the ball has gone", || {
+        shown.run_steps(1);
+        shown.query_by_label_contains("touches 0 places").map(drop).ok_or("it touches")
+    });
+}
+
 #[cfg(feature = "haptics")]
 #[test]
 fn the_stop_and_the_force_of_a_device_are_its_own() {

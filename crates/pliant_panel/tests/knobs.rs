@@ -8,7 +8,7 @@ use egui_kittest::{
 };
 use pliant_body::StepSettings;
 use pliant_panel::{
-    bodies::{self, BodyView, HandView},
+    bodies::{self, BodyView, ContactView, HandView},
     device::{self, DeviceView, DevicesView},
     network::{self, EmulatorView, NetworkView, UserView},
     recording::{self, RecordingView},
@@ -91,6 +91,18 @@ fn hands_are_taken_off_a_body_and_a_remote_body_keeps_its_own_settings() {
     harness.get_by_label("Let go").click();
     harness.run();
     assert!(harness.state()[0].release);
+}
+
+#[test]
+fn a_body_tells_what_it_touches_once_it_has() {
+    let mut harness =
+        Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
+    harness.run();
+    assert!(harness.query_by_label_contains("touches").is_none());
+    let contact = ContactView { places: 12, sliding: 2, force: 9.81, depth: 1e-4, ..Default::default() };
+    harness.state_mut()[0].contact = Some(contact);
+    harness.run();
+    harness.get_by_label("touches 12 places (2 slide) \u{b7} 9.81 N \u{b7} 0.10 mm deep");
 }
 
 #[test]

@@ -17,7 +17,7 @@ use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, V
 
 use crate::{
     RerunRecording, RerunScalars, RerunStats, RerunStyle,
-    frame::{BodyTransform, Drawn, Metric, RecordedFrame, RecordedHand, ShapeFrame},
+    frame::{BodyTransform, Drawn, Metric, RecordedContact, RecordedFrame, RecordedHand, ShapeFrame},
     log_lines::LogLines,
     worker::Worker,
 };
@@ -36,11 +36,29 @@ pub(crate) struct Collector {
     /// Whether there are new bodies that no frame contains yet.
     unsent_bodies: bool,
     had_hands: bool,
+    contacts: Touches,
     /// The diagnostics that were recorded.
     measured: HashMap<DiagnosticPath, Measured>,
     /// Grabs in the order of their drawing. `names` holds their names.
     order: Vec<Entity>,
     names: EntityHashMap<Called>,
+}
+
+/// The places where bodies touch.
+#[derive(Default)]
+struct Touches {
+    places: Vec<RecordedContact>,
+    /// Whether the places have to be drawn.
+    due: bool,
+    /// Whether places were ever drawn. Without them there is nothing to draw.
+    any: bool,
+}
+
+impl Touches {
+    /// The drawing was dropped, so that the places must be drawn again.
+    fn miss(&mut self) {
+        self.due = self.any;
+    }
 }
 
 struct Measured {
@@ -134,10 +152,28 @@ impl Collector {
             bodies: HashMap::new(),
             unsent_bodies: false,
             had_hands: false,
+            contacts: Touches::default(),
             measured: HashMap::new(),
             order: Vec::new(),
             names: EntityHashMap::default(),
         }
+    }
+
+    /// Takes the places where bodies touch, which are drawn if they have changed. `places` then has
+    /// the former ones.
+    #[cfg(feature = "contact")]
+    pub fn set_contacts(&mut self, places: &mut Vec<RecordedContact>) {
+        let touches = &mut self.contacts;
+        if *places != touches.places {
+            std::mem::swap(places, &mut touches.places);
+            (touches.due, touches.any) = (true, true);
+        }
+    }
+
+    /// The name under which a body is recorded. `None` before its first frame.
+    #[cfg(feature = "contact")]
+    pub fn path_of(&self, body: Entity) -> Option<&Arc<str>> {
+        self.bodies.get(&body).map(|followed| &followed.drawn.path)
     }
 }
 
@@ -190,6 +226,7 @@ pub(crate) fn decide(
         // No queue has room, so no frame is made. What is due stays due.
         collector.workers.iter_mut().for_each(Worker::miss);
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
+        collector.contacts.miss();
         own.forget_metrics();
         stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
         *wanted = WantedData::default();
@@ -268,6 +305,10 @@ pub(crate) fn collect(
     follow_bodies(collector, &mut frame, &bodies, wanted);
     if wanted.hands {
         gather_hands(collector, &mut frame, &grabs, &session);
+        if std::mem::take(&mut collector.contacts.due) {
+            frame.contacts_changed = true;
+            frame.contacts.extend_from_slice(&collector.contacts.places);
+        }
     }
     if wanted.metrics {
         std::mem::swap(&mut frame.scalars, &mut own.scalars);
@@ -293,6 +334,7 @@ pub(crate) fn collect(
     if missed {
         // The dropped frame may hold the last shape of a body, so the shape must be drawn again.
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
+        collector.contacts.miss();
     }
     stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();

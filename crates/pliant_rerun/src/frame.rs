@@ -25,6 +25,9 @@ pub(crate) struct RecordedFrame {
     /// All hands of the tick. `None` if hands are not due, and if there are none now and were none
     /// before.
     pub hands: Option<Vec<RecordedHand>>,
+    /// Where bodies touch, if that has changed.
+    pub contacts: Vec<RecordedContact>,
+    pub contacts_changed: bool,
     /// Diagnostics that were measured since the last tick.
     pub measured: Vec<(Arc<Metric>, f64)>,
     pub scalars: Vec<Scalar>,
@@ -47,6 +50,8 @@ impl RecordedFrame {
         self.shapes.clear();
         self.coordinates.clear();
         self.energies.clear();
+        self.contacts.clear();
+        self.contacts_changed = false;
         self.measured.clear();
         self.scalars.clear();
         self.samples.clear();
@@ -141,6 +146,16 @@ pub(crate) struct RecordedHand {
     pub force: [f64; 3],
     pub point: [f64; 3],
     pub target: [f64; 3],
+}
+
+/// A place where a body touches an obstacle or another body.
+#[cfg_attr(not(feature = "contact"), expect(dead_code, reason = "only contacts make it"))]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct RecordedContact {
+    pub point: [f32; 3],
+    /// Force on the body, N.
+    pub force: [f32; 3],
+    pub sliding: bool,
 }
 
 #[derive(Debug, Clone)]

@@ -26,7 +26,11 @@
 //! | any other | values set in [`RerunScalars`] |
 //! | `log` | refused inputs, lines written with [`RerunScalars::log`], and the app's log lines, with [`log_layer`] |
 //!
-//! With the feature `net`, the hands include those of the session's other users, and the log
+//! With the feature `contact`, `world/contacts` holds an arrow for the force of each place where a
+//! body touches, green where it holds and red where it slides. An arrow of half the largest body's
+//! size is the weight of the heaviest body, and none is longer than twice that. `contact/NAME` is
+//! the magnitude of their sum, N, with the deepest place, m, and the number of places. With the
+//! feature `net`, the hands include those of the session's other users, and the log
 //! includes users who join or leave and the state of the connection. With the feature `haptics`,
 //! `device/NAME/` holds the force, lateness and energy of every device, and the log includes the
 //! faults of the devices. With [`RerunRecording::device_loops`], `device/NAME/loop/` holds every
@@ -47,6 +51,8 @@
 mod blueprint;
 mod collect;
 mod columns;
+#[cfg(feature = "contact")]
+mod contact;
 mod frame;
 #[cfg(feature = "haptics")]
 mod haptics;
@@ -61,6 +67,8 @@ mod scalars;
 mod stress;
 #[cfg(test)]
 mod tests;
+#[cfg(all(test, feature = "contact"))]
+mod tests_contact;
 #[cfg(test)]
 mod tests_sinks;
 #[cfg(test)]

@@ -77,6 +77,7 @@ impl RerunPlugin {
             schedule: FixedUpdate.intern(),
             titles: vec![
                 ("displacement".into(), "Largest displacement".into()),
+                ("contact".into(), "Contact".into()),
                 ("device".into(), "Devices".into()),
                 ("net".into(), "Network".into()),
                 ("stress".into(), "Largest stress".into()),
@@ -208,7 +209,8 @@ pub struct RerunRecording {
     pub shapes_hz: f64,
     /// Rate of metrics, Hz. Default: infinite, every tick.
     pub metrics_hz: f64,
-    /// Rate of drawings of hands with their reactions, Hz. Default: infinite, every tick.
+    /// Rate of drawings of hands with their reactions, and of the forces where bodies touch, Hz.
+    /// Default: infinite, every tick.
     pub hands_hz: f64,
     /// Rate of drawings of mode energies and spectra, Hz. Default: `4.0`.
     pub modes_hz: f64,
@@ -342,6 +344,15 @@ impl Plugin for RerunPlugin {
                 crate::net::log_connection.run_if(collect::wants_text),
                 crate::net::log_metrics.run_if(collect::wants_metrics),
                 (crate::net::see_whose_hands, crate::net::see_other_hands).run_if(collect::wants_hands),
+            )
+                .in_set(Gathering),
+        );
+        #[cfg(feature = "contact")]
+        app.add_systems(
+            self.schedule,
+            (
+                crate::contact::see_contacts.run_if(collect::wants_hands),
+                crate::contact::plot_contacts.run_if(collect::wants_metrics),
             )
                 .in_set(Gathering),
         );

@@ -18,7 +18,7 @@ use crate::{
     RerunColor, RerunStyle, SIM_TIME, TICK, WALL_TIME,
     blueprint::Plots,
     columns::{Columns, HandColumns, Moment},
-    frame::{BodyTransform, Drawn, Line, Owed, RecordedFrame, RecordedHand, ShapeFrame},
+    frame::{BodyTransform, Drawn, Line, Owed, RecordedContact, RecordedFrame, RecordedHand, ShapeFrame},
     motion::ModalMotion,
     stress::StressSkin,
 };
@@ -31,6 +31,13 @@ const FULL_STRESS: f32 = 0.2;
 
 /// Length of the arrow of the largest force so far, as a fraction of the largest body's size.
 const LONGEST_ARROW: f64 = 0.5;
+
+/// Color of a place where a body holds, and of one where it slides.
+const HOLDS: usize = 2;
+const SLIDES: usize = 5;
+
+/// Standard acceleration of free fall, m/s^2.
+const GRAVITY: f64 = 9.806_65;
 
 /// Time for which a new plot waits for further new plots before the layout is sent again.
 const LAYOUT_PAUSE: Duration = Duration::from_millis(700);
@@ -64,6 +71,8 @@ pub(crate) struct Recorder {
     /// Size of the largest body so far, m, and the largest force so far, N, which scale the arrows.
     size: f64,
     force: f64,
+    /// Weight of the heaviest body so far, N, which scales the arrows of contacts.
+    weight: f64,
     positions: Vec<[f32; 3]>,
     normals: Vec<[f32; 3]>,
     sums: Vec<[f32; 3]>,
@@ -98,6 +107,7 @@ impl Recorder {
             bodies: HashMap::new(),
             size: 0.0,
             force: 0.0,
+            weight: 0.0,
             positions: Vec::new(),
             normals: Vec::new(),
             sums: Vec::new(),
@@ -126,6 +136,9 @@ impl Recorder {
         }
         if let Some(hands) = &frame.hands {
             self.hands(hands)?;
+        }
+        if frame.contacts_changed {
+            self.contacts(&frame.contacts)?;
         }
         for (metric, value) in &frame.measured {
             self.scalar(&metric.path, &metric.unit, *value)?;
@@ -205,6 +218,7 @@ impl Recorder {
         }
         self.leave(&body.path)?;
         self.size = self.size.max(body.model.size());
+        self.weight = self.weight.max(body.model.mass() * GRAVITY);
         let known = KnownEntity { body: body.clone(), place: None, meshed: false, motion: None, skin: None };
         self.bodies.insert(body.path.clone(), known);
         Ok(())
@@ -401,6 +415,24 @@ impl Recorder {
             self.stream.log(path(&format!("reaction/{name}")), &Clear::flat())?;
         }
         Ok(())
+    }
+
+    /// Draws the forces where bodies touch.
+    fn contacts(&mut self, places: &[RecordedContact]) -> Result<(), RecordingStreamError> {
+        let longest = LONGEST_ARROW * self.size;
+        let per_newton = if self.weight > 0.0 { longest / self.weight } else { 0.0 };
+        let arrow = |place: &RecordedContact| {
+            let force = place.force.map(f64::from);
+            let length = per_newton * force.iter().map(|f| f * f).sum::<f64>().sqrt();
+            let shorter = if length > 2.0 * longest { 2.0 * longest / length } else { 1.0 };
+            force.map(|f| (f * per_newton * shorter) as f32)
+        };
+        let color = |place: &RecordedContact| color_of(if place.sliding { SLIDES } else { HOLDS });
+        let arrows = Arrows3D::from_vectors(places.iter().map(arrow))
+            .with_origins(places.iter().map(|place| place.point))
+            .with_colors(places.iter().map(color))
+            .with_radii([0.004 * self.size as f32]);
+        self.stream.log("world/contacts", &arrows)
     }
 
     fn scalar(&mut self, name: &str, unit: &str, value: f64) -> Result<(), RecordingStreamError> {

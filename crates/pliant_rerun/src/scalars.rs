@@ -65,7 +65,7 @@ impl RerunScalars {
         self.line(true, text.into());
     }
 
-    #[cfg(feature = "haptics")]
+    #[cfg(any(feature = "contact", feature = "haptics"))]
     pub(crate) fn measured(&mut self, metric: &Arc<Metric>, value: f64) {
         if self.measured.len() < Self::LIMIT {
             self.measured.push((metric.clone(), value));

@@ -155,6 +155,37 @@ pub(crate) fn numbers(messages: &[LogMsg], path: &str, component: &str) -> Vec<f
     values
 }
 
+/// Returns all vectors of the component whose name ends with `component`, row by row.
+#[cfg(feature = "contact")]
+pub(crate) fn vectors(messages: &[LogMsg], path: &str, component: &str) -> Vec<[f32; 3]> {
+    use rerun::external::arrow::array::{FixedSizeListArray, Float32Array};
+    let mut vectors = Vec::new();
+    for chunk in chunks(messages, path) {
+        for column in chunk.components().values() {
+            if column.descriptor.to_string().ends_with(component) {
+                let array = column.list_array.values();
+                let array = array.as_any().downcast_ref::<FixedSizeListArray>().unwrap().values();
+                let array = array.as_any().downcast_ref::<Float32Array>().unwrap();
+                vectors.extend(array.values().as_chunks().0);
+            }
+        }
+    }
+    vectors
+}
+
+/// Returns how many values each row of the component has whose name ends with `component`.
+#[cfg(feature = "contact")]
+pub(crate) fn row_lengths(messages: &[LogMsg], path: &str, component: &str) -> Vec<usize> {
+    use rerun::external::arrow::array::Array;
+    let of = |chunk: &Chunk| -> Vec<usize> {
+        let mut columns = chunk.components().values();
+        let found = columns.find(|column| column.descriptor.to_string().ends_with(component));
+        let rows = found.into_iter().flat_map(|column| column.list_array.iter().flatten());
+        rows.map(|row| row.len()).collect()
+    };
+    chunks(messages, path).iter().flat_map(of).collect()
+}
+
 /// Returns the colors of a path, row by row: red, green and blue.
 pub(crate) fn bytes_of_colors(messages: &[LogMsg], path: &str) -> Vec<[u8; 3]> {
     let mut colors = Vec::new();

@@ -24,6 +24,8 @@ use crate::{
 pub(super) struct SceneHistories {
     energies: EntityHashMap<Trace>,
     forces: HashMap<HandKey, Trace>,
+    #[cfg(feature = "contact")]
+    contacts: EntityHashMap<Trace>,
     /// Whether a body's header is closed.
     folded: EntityHashMap<bool>,
     step_ms: Trace,
@@ -63,6 +65,8 @@ pub(super) struct SceneParam<'w, 's> {
         ),
     >,
     grabs: Query<'w, 's, (NameOrEntity, &'static GrabForce), With<Grab>>,
+    #[cfg(feature = "contact")]
+    contacts: Query<'w, 's, &'static pliant_contact::BodyContacts>,
     #[cfg(feature = "net")]
     people: super::hands::People<'w, 's>,
 }
@@ -107,6 +111,8 @@ impl SceneParam<'_, '_> {
         // hands and users who left.
         let mut energies = std::mem::take(&mut self.histories.energies);
         let mut forces = std::mem::take(&mut self.histories.forces);
+        #[cfg(feature = "contact")]
+        let mut contacts = std::mem::take(&mut self.histories.contacts);
         let folded = std::mem::take(&mut self.histories.folded);
         let mut found: Vec<_> = self.bodies.iter_mut().collect();
         found.sort_by_key(|(name, ..)| name.entity);
@@ -134,6 +140,10 @@ impl SceneParam<'_, '_> {
                 view.energy = energy_of(state, driven, *shown);
                 view.energies = energies.remove(&name.entity).unwrap_or_default();
                 view.energies.push(now, view.energy);
+                #[cfg(feature = "contact")]
+                if let Ok(touched) = self.contacts.get(name.entity) {
+                    view.contact = contact_of(touched, contacts.remove(&name.entity), now);
+                }
                 for &grab in grabs.map(Grabs::entities).unwrap_or_default() {
                     let Ok((name, force)) = self.grabs.get(grab) else { continue };
                     #[cfg(feature = "net")]
@@ -182,9 +192,33 @@ impl SceneParam<'_, '_> {
                 }
             }
             histories.energies.insert(name.entity, view.energies);
+            #[cfg(feature = "contact")]
+            histories.contacts.extend(view.contact.map(|contact| (name.entity, contact.forces)));
             histories.forces.extend(keys.into_iter().zip(view.hands.into_iter().map(|hand| hand.forces)));
         }
     }
+}
+
+/// What a body touches at time `now` (s), if it has touched anything. `forces` is its history.
+#[cfg(feature = "contact")]
+fn contact_of(
+    touched: &pliant_contact::BodyContacts,
+    forces: Option<Trace>,
+    now: f64,
+) -> Option<bodies::ContactView> {
+    if forces.is_none() && touched.0.is_empty() {
+        return None;
+    }
+    let mut forces = forces.unwrap_or_default();
+    let force = touched.force().length();
+    forces.push(now, force);
+    Some(bodies::ContactView {
+        places: touched.0.len(),
+        sliding: touched.0.iter().filter(|place| place.sliding).count(),
+        force,
+        depth: touched.0.iter().map(|place| place.penetration).fold(0.0, f64::max),
+        forces,
+    })
 }
 
 /// Returns the name of a body without a name of its own: the name of the file from which it was
