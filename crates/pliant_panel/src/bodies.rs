@@ -36,7 +36,7 @@ pub struct BodyView {
     pub energies: Trace,
     /// The hands on the body.
     pub hands: Vec<HandView>,
-    /// What the body touches. `None` if it has touched nothing.
+    /// What the body touches. `None` if it has touched nothing since its header was opened.
     pub contact: Option<ContactView>,
     /// Whether the body's header is closed, so that the fields shown below the header need not be
     /// filled in. [`show`] sets this for the next frame. A body that is folded when it is first

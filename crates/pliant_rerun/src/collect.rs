@@ -50,15 +50,6 @@ struct Touches {
     places: Vec<RecordedContact>,
     /// Whether the places have to be drawn.
     due: bool,
-    /// Whether places were ever drawn. Without them there is nothing to draw.
-    any: bool,
-}
-
-impl Touches {
-    /// The drawing was dropped, so that the places must be drawn again.
-    fn miss(&mut self) {
-        self.due = self.any;
-    }
 }
 
 struct Measured {
@@ -166,7 +157,7 @@ impl Collector {
         let touches = &mut self.contacts;
         if *places != touches.places {
             std::mem::swap(places, &mut touches.places);
-            (touches.due, touches.any) = (true, true);
+            touches.due = true;
         }
     }
 
@@ -226,7 +217,6 @@ pub(crate) fn decide(
         // No queue has room, so no frame is made. What is due stays due.
         collector.workers.iter_mut().for_each(Worker::miss);
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
-        collector.contacts.miss();
         own.forget_metrics();
         stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
         *wanted = WantedData::default();
@@ -305,7 +295,9 @@ pub(crate) fn collect(
     follow_bodies(collector, &mut frame, &bodies, wanted);
     if wanted.hands {
         gather_hands(collector, &mut frame, &grabs, &session);
-        if std::mem::take(&mut collector.contacts.due) {
+        // A new body may be the largest or the heaviest, by which the arrows are scaled.
+        let scaled = collector.unsent_bodies && !collector.contacts.places.is_empty();
+        if std::mem::take(&mut collector.contacts.due) || scaled {
             frame.contacts_changed = true;
             frame.contacts.extend_from_slice(&collector.contacts.places);
         }
@@ -334,7 +326,7 @@ pub(crate) fn collect(
     if missed {
         // The dropped frame may hold the last shape of a body, so the shape must be drawn again.
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
-        collector.contacts.miss();
+        own.lost += 1;
     }
     stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();

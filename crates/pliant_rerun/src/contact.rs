@@ -39,6 +39,8 @@ pub(crate) struct Plotted {
     body: Arc<str>,
     metrics: [Arc<Metric>; 3],
     last: [f64; 3],
+    /// [`RerunScalars::lost`] when they were set.
+    lost: u64,
 }
 
 /// Plots what each body feels where it touches. A body that has touched nothing has no plot, and
@@ -59,16 +61,16 @@ pub(crate) fn plot_contacts(
             let metric = |what: &str, unit: &str| {
                 Arc::new(Metric { path: format!("contact/{body}{what}"), unit: unit.to_owned() })
             };
-            let metrics = [metric("", "N"), metric(" depth", "m"), metric(" places", "")];
-            plotted.insert(entity, Plotted { body: body.clone(), metrics, last: [f64::NAN; 3] });
+            let metrics = [metric("", "N"), metric("/depth", "m"), metric("/places", "")];
+            plotted.insert(entity, Plotted { body: body.clone(), metrics, last: [f64::NAN; 3], lost: 0 });
         }
         let Some(known) = plotted.get_mut(&entity) else { continue };
         let depth = contacts.0.iter().map(|place| place.penetration).fold(0.0, f64::max);
         let now = [contacts.force().length(), depth, contacts.0.len() as f64];
-        if state.is_resting() && now == known.last {
+        if state.is_resting() && now == known.last && known.lost == own.lost {
             continue;
         }
-        known.last = now;
+        (known.last, known.lost) = (now, own.lost);
         for (metric, value) in known.metrics.iter().zip(now) {
             own.measured(metric, value);
         }

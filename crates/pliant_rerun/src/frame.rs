@@ -83,6 +83,8 @@ pub(crate) struct Owed {
     pub lines: Vec<Line>,
     /// Whether the last missed list of hands was empty, so that the drawn hands must be removed.
     pub no_hands: bool,
+    /// The last missed list of the places where bodies touch.
+    pub contacts: Option<Vec<RecordedContact>>,
 }
 
 impl Owed {
@@ -94,6 +96,9 @@ impl Owed {
         self.lines.extend(missed.lines.iter().take(room).cloned());
         if let Some(hands) = &missed.hands {
             self.no_hands = hands.is_empty();
+        }
+        if missed.contacts_changed {
+            self.contacts = Some(missed.contacts.clone());
         }
     }
 }
@@ -149,7 +154,6 @@ pub(crate) struct RecordedHand {
 }
 
 /// A place where a body touches an obstacle or another body.
-#[cfg_attr(not(feature = "contact"), expect(dead_code, reason = "only contacts make it"))]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct RecordedContact {
     pub point: [f32; 3],

@@ -32,8 +32,10 @@ const FULL_STRESS: f32 = 0.2;
 /// Length of the arrow of the largest force so far, as a fraction of the largest body's size.
 const LONGEST_ARROW: f64 = 0.5;
 
-/// Color of a place where a body holds, and of one where it slides.
+/// Index in [`COLORS`] of a place where a body touches and holds.
 const HOLDS: usize = 2;
+
+/// Index in [`COLORS`] of a place where a body touches and slides.
 const SLIDES: usize = 5;
 
 /// Standard acceleration of free fall, m/s^2.
@@ -187,6 +189,9 @@ impl Recorder {
         }
         if owed.no_hands && next.hands.is_none() {
             self.hands(&[])?;
+        }
+        if let Some(contacts) = owed.contacts.as_ref().filter(|_| !next.contacts_changed) {
+            self.contacts(contacts)?;
         }
         self.lines(&owed.lines)
     }

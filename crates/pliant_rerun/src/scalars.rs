@@ -31,6 +31,9 @@ pub struct RerunScalars {
     pub(crate) measured: Vec<(Arc<Metric>, f64)>,
     /// Samples of the device loops.
     pub(crate) samples: Vec<Samples>,
+    /// Number of times that metrics may have been lost. What is only set when it changes is then
+    /// set again.
+    pub(crate) lost: u64,
 }
 
 impl RerunScalars {
@@ -74,6 +77,7 @@ impl RerunScalars {
 
     /// Drops metrics that were not taken at their time.
     pub(crate) fn forget_metrics(&mut self) {
+        self.lost += 1;
         self.scalars.clear();
         self.measured.clear();
         self.samples.clear();

@@ -71,7 +71,7 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
             seen.extend(slow.read());
         }
         // The sink stops reading, and its two places fill. Then the hand and the body are removed,
-        // and lines are logged.
+        // lines are logged, and a contact comes.
         app.update();
         app.update();
         let gone: Vec<Entity> = app
@@ -80,6 +80,8 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
             .iter(app.world())
             .collect();
         gone.into_iter().for_each(|entity| app.world_mut().despawn(entity).then_some(()).unwrap());
+        #[cfg(feature = "contact")]
+        app.world_mut().spawn(crate::tests_contact::touching());
         for line in ["first", "second", "third"] {
             app.world_mut().resource_mut::<RerunScalars>().log(line);
             app.world_mut().resource_mut::<RerunScalars>().set("of/then", "", 1.0);
@@ -95,6 +97,8 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
         assert_eq!(rows(&messages, "/world/square", "is_recursive"), 1, "the body does not stay as a ghost");
         assert_eq!(rows(&messages, "/reaction/hand", "is_recursive"), 1, "nor does the hand");
         assert_eq!(rows(&messages, "/log", "text"), 3, "every line, once");
+        #[cfg(feature = "contact")]
+        assert_eq!(rows(&messages, "/world/contacts", "vectors"), 1, "what touches, once");
         assert!(
             numbers(&messages, "/of/then", "scalars").is_empty(),
             "figures of a lost tick are not another's"
@@ -103,6 +107,8 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
             let messages = played(quick);
             assert_eq!(rows(&messages, "/log", "text"), 3, "the other sink had them already");
             assert_eq!(rows(&messages, "/world/square", "is_recursive"), 1);
+            #[cfg(feature = "contact")]
+            assert_eq!(rows(&messages, "/world/contacts", "vectors"), 1);
         }
     }
 }

@@ -526,8 +526,8 @@ pub struct RecordingEntry {
     /// Rate at which metrics are recorded, Hz, 0 to 1e6. Default: `None`, every tick.
     #[serde(default)]
     pub metrics_hz: Option<f64>,
-    /// Rate at which hands and their reactions are recorded, Hz, 0 to 1e6. Default: `None`, every
-    /// tick.
+    /// Rate at which hands with their reactions and the forces of contacts are recorded, Hz, 0 to
+    /// 1e6. Default: `None`, every tick.
     #[serde(default)]
     pub hands_hz: Option<f64>,
     /// Rate at which the energies of the modes and the spectrum are recorded, Hz, 0 to 1000.

@@ -165,7 +165,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 
 type Form = (&'static str, BarBody, fn(&BarBody) -> Result<TetMesh, LabError>);
 
-/// Bodies that move otherwise than a bar of equal cells: names and meshes.
+/// Bodies of other proportions and shapes: names and meshes.
 fn forms() -> [Form; 8] {
     let bar = BarBody::default;
     [
