@@ -291,7 +291,7 @@ fn a_ball_that_presses_a_body_is_told_with_its_force_and_when_it_has_gone() {
     shown.run_steps(3);
     assert!(shown.query_by_label_contains("touches").is_none());
     let ball = Obstacle::Ball { radius: 0.05 };
-    let at = Transform::from_translation(Vec3::from(top) + Vec3::Y * 0.045);
+    let at = Transform::from_translation(Vec3::from(top) + Vec3::Y * 0.02);
     let ball = shown.state_mut().world_mut().spawn((ball, at)).id();
     until("the ball's force is told", || {
         shown.run_steps(1);
