@@ -234,8 +234,8 @@ fn squeezed(elasticity: Elasticity, rate: f64) -> Result<CaseOutcome, LabError> 
     }
     let away = (Vector3::from(body.frame().center()) - Vector3::from(model.center_of_mass())).norm();
     Ok(CaseOutcome::of(vec![
-        Bound::new("fastest rms speed / speed of sound", fastest / sound, 0.05),
-        Bound::new("how far the center goes / size", away / model.size(), 0.01),
+        Bound::new("fastest rms speed / speed of sound", fastest / sound, 0.03),
+        Bound::new("how far the center goes / size", away / model.size(), 0.006),
     ]))
 }
 

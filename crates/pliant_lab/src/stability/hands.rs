@@ -221,8 +221,8 @@ fn twist(young: f64, corrections: u8) -> Result<CaseOutcome, LabError> {
         starts.iter().map(|s| (turned(s, i) - s).into()).collect()
     })?;
     Ok(CaseOutcome::of(vec![
-        Bound::new("farthest a corner goes / size", farthest / model.size(), 1.0),
-        Bound::new("change of a held reaction in a step / reaction", held, 0.03),
+        Bound::new("farthest a corner goes / size", farthest / model.size(), 0.6),
+        Bound::new("change of a held reaction in a step / reaction", held, 0.02),
         Bound::new("energy left when let go / largest", body.energy() / energy, RESTED),
     ])
     .beside(plain)
