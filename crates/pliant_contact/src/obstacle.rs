@@ -221,6 +221,10 @@ impl Motion {
     fn visit<V: Visit>(&self, scale: f64, visit: V) -> V::Output {
         let whole = self.scale.abs().max_element() / scale;
         let center = [0.0; 3];
+        #[cfg_attr(
+            not(feature = "mesh"),
+            expect(clippy::infallible_destructuring_match, reason = "there are solids, too")
+        )]
         let plain = match &self.shape {
             Shape::Plain(plain) => plain,
             #[cfg(feature = "mesh")]

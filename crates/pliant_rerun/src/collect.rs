@@ -114,6 +114,10 @@ pub(crate) struct WantedData {
     /// Whether the energies of the modes are drawn as bars.
     bars: bool,
     /// Whether states that are logged as text are checked for changes, a few times per second.
+    #[cfg_attr(
+        not(any(feature = "haptics", feature = "net")),
+        expect(dead_code, reason = "only these log texts")
+    )]
     texts: bool,
     /// Length of a tick, s.
     tick: f64,
@@ -172,14 +176,17 @@ pub(crate) fn somebody_listens(collector: Res<Collector>, recording: Res<RerunRe
     recording.on && collector.workers.iter().any(Worker::listens)
 }
 
+#[cfg(any(feature = "contact", feature = "haptics", feature = "net"))]
 pub(crate) fn wants_metrics(wanted: Res<WantedData>) -> bool {
     wanted.metrics
 }
 
+#[cfg(any(feature = "contact", feature = "net"))]
 pub(crate) fn wants_hands(wanted: Res<WantedData>) -> bool {
     wanted.hands
 }
 
+#[cfg(any(feature = "haptics", feature = "net"))]
 pub(crate) fn wants_text(wanted: Res<WantedData>) -> bool {
     wanted.texts
 }
