@@ -27,11 +27,11 @@
 //! | `log` | refused inputs, lines written with [`RerunScalars::log`], and the app's log lines, with [`log_layer`] |
 //!
 //! With the feature `contact`, `world/contacts` holds an arrow for the force of each place where a
-//! body touches, green where it holds and red where it slides. An arrow of half the largest body's
-//! size (without the scale of its entity) is the weight of the heaviest body, and none is longer
-//! than twice that. `contact/NAME` is the magnitude of the sum of the forces on that body, N,
-//! `contact/NAME/depth` the depth of its deepest place, m, and `contact/NAME/places` the number of
-//! places.
+//! body touches. It ends there, and is green where it holds and red where it slides. An arrow of
+//! half the largest body's size (without the scale of its entity) is the weight of the heaviest
+//! body, and none is longer than twice that. `contact/NAME` is the magnitude of the sum of the
+//! forces on that body, N, `contact/NAME/depth` the depth of its deepest place, m, and
+//! `contact/NAME/places` the number of places.
 //!
 //! With the feature `net`, the hands include those of the session's other users, and the log
 //! includes users who join or leave and the state of the connection. With the feature `haptics`,

@@ -432,11 +432,16 @@ impl Recorder {
             let shorter = if length > 2.0 * longest { 2.0 * longest / length } else { 1.0 };
             force.map(|f| (f * per_newton * shorter) as f32)
         };
+        // It ends where it presses: beyond that it would be hidden in the body.
+        let start = |place: &RecordedContact| {
+            let arrow = arrow(place);
+            std::array::from_fn::<f32, 3, _>(|k| place.point[k] - arrow[k])
+        };
         let color = |place: &RecordedContact| color_of(if place.sliding { SLIDES } else { HOLDS });
         let arrows = Arrows3D::from_vectors(places.iter().map(arrow))
-            .with_origins(places.iter().map(|place| place.point))
+            .with_origins(places.iter().map(start))
             .with_colors(places.iter().map(color))
-            .with_radii([0.004 * self.size as f32]);
+            .with_radii([0.008 * self.size as f32]);
         self.stream.log("world/contacts", &arrows)
     }
 
