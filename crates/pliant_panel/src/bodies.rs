@@ -164,10 +164,8 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
     if let Some(contact) = &body.contact {
         let ContactView { places, sliding, force, depth, forces } = contact;
         let (force, depth) = (short(*force), short(1e3 * depth));
-        ui.label(format!(
-            "touches {places} places ({sliding} slide) \u{b7} {force} N \u{b7} {depth} mm deep"
-        ))
-        .on_hover_text("The sum of the forces on the body where it touches, and its deepest place.");
+        ui.label(format!("contacts: {places} ({sliding} slide) \u{b7} {force} N \u{b7} {depth} mm deep"))
+            .on_hover_text("The sum of the forces on the body where it touches, and its deepest place.");
         plot(ui, &format!("pliant contact {index}"), "N", [("contact", forces, color(1))]);
     }
 }

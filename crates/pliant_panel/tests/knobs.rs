@@ -98,11 +98,11 @@ fn a_body_tells_what_it_touches_once_it_has() {
     let mut harness =
         Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
     harness.run();
-    assert!(harness.query_by_label_contains("touches").is_none());
+    assert!(harness.query_by_label_contains("contacts:").is_none());
     let contact = ContactView { places: 12, sliding: 2, force: 9.81, depth: 1e-4, ..Default::default() };
     harness.state_mut()[0].contact = Some(contact);
     harness.run();
-    harness.get_by_label("touches 12 places (2 slide) \u{b7} 9.81 N \u{b7} 0.10 mm deep");
+    harness.get_by_label("contacts: 12 (2 slide) \u{b7} 9.81 N \u{b7} 0.10 mm deep");
 }
 
 #[test]

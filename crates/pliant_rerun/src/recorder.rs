@@ -428,18 +428,17 @@ impl Recorder {
         let per_newton = if self.weight > 0.0 { longest / self.weight } else { 0.0 };
         let arrow = |place: &RecordedContact| {
             let force = place.force.map(f64::from);
-            let length = per_newton * force.iter().map(|f| f * f).sum::<f64>().sqrt();
-            let shorter = if length > 2.0 * longest { 2.0 * longest / length } else { 1.0 };
-            force.map(|f| (f * per_newton * shorter) as f32)
+            let longest = 2.0 * longest / force.iter().map(|f| f * f).sum::<f64>().sqrt();
+            force.map(|f| (f * per_newton.min(longest)) as f32)
         };
-        // It ends where it presses: beyond that it would be hidden in the body.
-        let start = |place: &RecordedContact| {
-            let arrow = arrow(place);
+        let arrows: Vec<[f32; 3]> = places.iter().map(arrow).collect();
+        // An arrow ends where it presses: beyond that it would be hidden in the body.
+        let start = |(place, arrow): (&RecordedContact, &[f32; 3])| {
             std::array::from_fn::<f32, 3, _>(|k| place.point[k] - arrow[k])
         };
         let color = |place: &RecordedContact| color_of(if place.sliding { SLIDES } else { HOLDS });
-        let arrows = Arrows3D::from_vectors(places.iter().map(arrow))
-            .with_origins(places.iter().map(start))
+        let arrows = Arrows3D::from_vectors(&arrows)
+            .with_origins(places.iter().zip(&arrows).map(start))
             .with_colors(places.iter().map(color))
             .with_radii([0.008 * self.size as f32]);
         self.stream.log("world/contacts", &arrows)
