@@ -428,17 +428,17 @@ fn what_a_scene_leaves_out_is_what_was_measured() {
         ("`PliantPlugins` adds 36 to the engine's", "solo", "engine_systems"),
         ("drawn by the processor take", "many", "work_frame_ms"),
         ("a host without a picture is", "host", "program_mb"),
-        ("43 MB, and takes", "host", "rest_frame_ms"),
-        ("0.60 ms for a frame at rest and", "host", "work_frame_ms"),
+        ("35 MB, and takes", "host", "rest_frame_ms"),
+        ("0.56 ms for a frame at rest and", "host", "work_frame_ms"),
         ("A program with a window is", "solo", "program_mb"),
-        ("104 MB, and one with everything", "everything", "program_mb"),
+        ("95 MB, and one with everything", "everything", "program_mb"),
     ] {
         says(MEASUREMENTS, before, of(scene, column));
     }
     let more = |scene| of(scene, "work_frame_ms") - of(scene, "rest_frame_ms");
     says(MEASUREMENTS, "In motion, one body adds", more("solo"));
-    says(MEASUREMENTS, "0.38 ms, a guest's body", more("guest"));
-    says(MEASUREMENTS, "0.63 ms, everything together", more("everything"));
+    says(MEASUREMENTS, "0.45 ms, a guest's body", more("guest"));
+    says(MEASUREMENTS, "0.74 ms, everything together", more("everything"));
     says(DECISIONS, "A body with a window compiles", of("solo", "crates"));
     says(DECISIONS, "327 crates, a host without a picture", of("host", "crates"));
     says(DECISIONS, "216, and everything together", of("everything", "crates"));
