@@ -324,14 +324,15 @@ fn a_body_that_falls_and_is_dragged_is_shown_where_it_is() {
 fn a_pile_is_shown_where_it_is() {
     let [falls, dragged, own] = run(10, true);
     assert!(falls.count > 4000.0 && dragged.count > 2000.0 && own.count > 200.0);
-    assert!(falls.rms() < 0.01 && falls.largest < 0.1, "{falls:?}");
-    assert!(dragged.rms() < 0.01 && dragged.largest < 0.1, "{dragged:?}");
+    assert!(falls.rms() < 0.004 && falls.largest < 0.1, "{falls:?}");
+    assert!(dragged.rms() < 0.005 && dragged.largest < 0.1, "{dragged:?}");
     // The guest's own copy of the body that it drags goes through the others, which it learns of as
     // a load only. Without the floor it is farther off still.
     let [falls_through, dragged_through, own_through] = run(10, false);
     assert!(falls.rms() < 0.5 * falls_through.rms(), "{falls:?} {falls_through:?}");
-    // Most of it are the impulses between the bodies, which only the host knows.
-    assert!(dragged.rms() < 0.75 * dragged_through.rms(), "{dragged:?} {dragged_through:?}");
+    // Most of it are the impulses between the bodies, which only the host knows: .40 % with the
+    // floor and .52 % without.
+    assert!(dragged.rms() < 0.8 * dragged_through.rms(), "{dragged:?} {dragged_through:?}");
     assert!(own.rms() < 0.65 * own_through.rms(), "{own:?} {own_through:?}");
 }
 

@@ -166,6 +166,7 @@ fn corpora_are_written() {
                 force: [0.0, 3.0, 0.0],
                 anchor: [0.5; 3],
                 toward: [0.0, -1.0, 0.0],
+                leads: Some(1e-3),
             }],
             ..ContactState::default()
         },

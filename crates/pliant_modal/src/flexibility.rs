@@ -48,6 +48,17 @@ impl ModalModel {
         std::array::from_fn(|i| std::array::from_fn(|j| flexibility[(i, j)]))
     }
 
+    /// Residual flexibility (3x3, m/N) of a patch of this surface, and its sharpness (1/m): that of
+    /// each vertex with the others, and that of the vertices with themselves.
+    pub(crate) fn flexibility_and_sharpness(&self, patch: &Patch, kept: usize) -> (Matrix3<f64>, [f64; 2]) {
+        let flexibility = Matrix3::from(self.flexibility_of(patch, kept)).transpose();
+        let pairs = patch.entries().len() <= PAIRS;
+        let [own, others] = terms(self.surface(), patch, pairs);
+        // Without pairs a disc has 1 / sqrt(A), and with them 16 / (3 pi a).
+        let disc = 16.0 / (3.0 * std::f64::consts::PI.sqrt());
+        (flexibility, if pairs { [others, own] } else { [disc * own.sqrt(), 0.0] })
+    }
+
     fn baked_flexibility(&self, patch: &Patch) -> Matrix3<f64> {
         let info = self.info();
         let radii = self.site_radii();
@@ -124,6 +135,13 @@ impl ModalModel {
 /// so `3 / sqrt(A)`). Without `pairs`, for large patches, it is one over the root of the area that
 /// carries the force, `sqrt(sum w^2 / A)`. Anchored vertices cannot move and do not count.
 fn sharpness(surface: &SurfaceMesh, patch: &Patch, pairs: bool) -> f64 {
+    let [own, others] = terms(surface, patch, pairs);
+    let sharpness = if pairs { own + others } else { own.sqrt() };
+    sharpness.max(f64::MIN_POSITIVE)
+}
+
+/// The terms of the sharpness: of vertices with themselves, and with each other.
+fn terms(surface: &SurfaceMesh, patch: &Patch, pairs: bool) -> [f64; 2] {
     let moving = || patch.entries().iter().filter(|(v, _)| !surface.anchored()[*v as usize]);
     let at = |v: u32| surface.positions()[v as usize].map(f64::from);
     let mut own = 0.0;
@@ -144,6 +162,5 @@ fn sharpness(surface: &SurfaceMesh, patch: &Patch, pairs: bool) -> f64 {
             }
         }
     }
-    let sharpness = if pairs { own + others } else { own.sqrt() };
-    sharpness.max(f64::MIN_POSITIVE)
+    [own, others]
 }

@@ -203,17 +203,19 @@ pub(crate) struct PlainMemory {
     anchor: [f64; 3],
     toward: [f64; 3],
     place: Option<Place>,
+    leads: Option<f64>,
 }
 
 impl From<Memory> for PlainMemory {
-    fn from(Memory { other, site, force, anchor, toward, place }: Memory) -> Self {
-        Self { other, site, force: force.into(), anchor: anchor.into(), toward: toward.into(), place }
+    fn from(Memory { other, site, force, anchor, toward, place, leads }: Memory) -> Self {
+        let [force, anchor, toward] = [force, anchor, toward].map(Into::into);
+        Self { other, site, force, anchor, toward, place, leads }
     }
 }
 
 impl From<PlainMemory> for Memory {
-    fn from(PlainMemory { other, site, force, anchor, toward, place }: PlainMemory) -> Self {
+    fn from(PlainMemory { other, site, force, anchor, toward, place, leads }: PlainMemory) -> Self {
         let [force, anchor, toward] = [force, anchor, toward].map(Vector3::from);
-        Self { other, site, force, anchor, toward, place }
+        Self { other, site, force, anchor, toward, place, leads }
     }
 }

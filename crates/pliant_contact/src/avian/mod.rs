@@ -73,6 +73,10 @@ impl ObstacleShape for InWorldOf {
         SurfacePoint { distance: found.distance / self.factor, ..found }
     }
 
+    fn curvature(&self) -> f64 {
+        self.factor * self.shape.curvature()
+    }
+
     fn check(&self) -> Result<(), StepError> {
         self.shape.check()
     }
@@ -96,6 +100,10 @@ impl<O: ObstacleShape> ObstacleShape for Owned<O> {
 
     fn velocity(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.shape.velocity(point)
+    }
+
+    fn curvature(&self) -> f64 {
+        self.shape.curvature()
     }
 
     fn check(&self) -> Result<(), StepError> {

@@ -77,12 +77,16 @@ pub struct ContactMemory {
     /// Direction from the center of the site to its contact point, body axes. Zero for a site that
     /// is not round.
     pub toward: [f64; 3],
+    /// Energy in the dent, J, 0 or more, where the site stands for all of a part of the surface
+    /// that is a part of a sphere.
+    pub leads: Option<f64>,
 }
 
 impl ContactMemory {
     fn is_valid(&self) -> bool {
         let near = |x: &[f64; 3]| x.iter().all(|x| x.abs() <= ContactState::LARGEST);
-        near(&self.force) && near(&self.anchor) && self.toward.iter().all(|x| x.abs() <= 1.0 + 1e-6)
+        let stored = self.leads.is_none_or(|energy| (0.0..=ContactState::LARGEST).contains(&energy));
+        stored && near(&self.force) && near(&self.anchor) && self.toward.iter().all(|x| x.abs() <= 1.0 + 1e-6)
     }
 }
 
@@ -279,6 +283,7 @@ impl Contacts {
                 force: memory.force.into(),
                 anchor: memory.anchor.into(),
                 toward: memory.toward.into(),
+                leads: memory.leads,
             };
             memory.is_valid().then_some(memory)
         }));
@@ -297,6 +302,7 @@ impl Contacts {
             anchor: memory.anchor.into(),
             toward: memory.toward.into(),
             place: None,
+            leads: memory.leads,
         }));
     }
 

@@ -87,6 +87,10 @@ impl ObstacleShape for FixedObstacle {
         self.visit(|obstacle| obstacle.at(point))
     }
 
+    fn curvature(&self) -> f64 {
+        self.visit(|obstacle| obstacle.curvature())
+    }
+
     /// Refuses numbers beyond 1e6 too, and rotations whose length is not 1 within 1e-3.
     fn check(&self) -> Result<(), StepError> {
         self.visit(|obstacle| obstacle.check())?;

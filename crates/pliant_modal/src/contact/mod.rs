@@ -12,6 +12,10 @@
 //! |f_t| <= mu f_n,  y_t at its anchor or sliding   Coulomb, in the tangent plane
 //! ```
 //!
+//! Where a part of the surface is a part of a sphere, it touches an obstacle at one place, which
+//! moves over the sphere and is carried by the sites around it. `C` is then the dent of Hertz,
+//! which is not linear.
+//!
 //! The tangential law holds positions, not velocities: a site that sticks has an *anchor*, so a
 //! body at rest on an incline does not creep. The laws of all contacts are solved together by block
 //! Gauss-Seidel in modal space, with the exact solution of each block.
@@ -23,6 +27,7 @@
 mod cone;
 mod contacts;
 mod fixed;
+mod indent;
 mod obstacle;
 mod point;
 mod probe;
@@ -39,6 +44,7 @@ pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, Surfac
 pub use probe::{Probe, ProbeConfig, ProbeContact};
 pub use rigid::{Rigid, Support};
 
+pub(crate) use indent::Indent;
 pub(crate) use point::{AtProbe, AtRigid, AtSupport, ContactPoint, Far, Memory};
 pub(crate) use probe::{Grown, ProbeMemory};
 pub(crate) use rigid::Pushed;

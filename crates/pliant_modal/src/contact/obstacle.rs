@@ -31,6 +31,13 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
         Vector3::zeros()
     }
 
+    /// Mean curvature of the surface, 1/m, positive for a ball. It decides how wide a contact with
+    /// a part of a body that is a part of a sphere is. Default: 0, for a shape that is flat where
+    /// it is touched.
+    fn curvature(&self) -> f64 {
+        0.0
+    }
+
     /// Checks the numbers of the obstacle.
     ///
     /// # Errors
@@ -113,6 +120,10 @@ impl ObstacleShape for Sphere {
         SurfacePoint { distance: length - self.radius, normal }
     }
 
+    fn curvature(&self) -> f64 {
+        1.0 / self.radius
+    }
+
     fn check(&self) -> Result<(), StepError> {
         finite("center of a sphere", &self.center)?;
         not_negative("radius of a sphere", self.radius)
@@ -144,6 +155,11 @@ impl ObstacleShape for Capsule {
         let (_, across) = direction(across, Vector3::y());
         let (length, normal) = direction(point - (a + t * along), across);
         SurfacePoint { distance: length - self.radius, normal }
+    }
+
+    /// That of its side.
+    fn curvature(&self) -> f64 {
+        0.5 / self.radius
     }
 
     fn check(&self) -> Result<(), StepError> {
@@ -240,6 +256,10 @@ impl<O: ObstacleShape> ObstacleShape for Moving<O> {
     fn velocity(&self, point: &Vector3<f64>) -> Vector3<f64> {
         let arm = point - Vector3::from(self.position);
         Vector3::from(self.velocity) + Vector3::from(self.angular_velocity).cross(&arm)
+    }
+
+    fn curvature(&self) -> f64 {
+        self.shape.curvature()
     }
 
     fn check(&self) -> Result<(), StepError> {

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{Touched, cone::Status, surface_field::Carriers, surface_field::Place};
+use super::{Indent, Touched, cone::Status, surface_field::Carriers, surface_field::Place};
 use crate::{saved::PlainMemory, step::Tangent};
 
 /// A contact of the last step.
@@ -21,6 +21,8 @@ pub(crate) struct Memory {
     pub(crate) toward: Vector3<f64>,
     /// The place of the other body.
     pub(crate) place: Option<Place>,
+    /// Energy in the dent, J, where the site leads a ball.
+    pub(crate) leads: Option<f64>,
 }
 
 /// The side of a contact at another body.
@@ -103,6 +105,9 @@ pub(crate) struct ContactPoint {
     /// The side at a rigid body to which the obstacle belongs.
     pub(crate) rigid: Option<AtRigid>,
     pub(crate) support: Option<AtSupport>,
+    /// The law of the dent where the site leads a ball. The compliance is its tangent, and the
+    /// offset has its shift.
+    pub(crate) indent: Option<Indent>,
     pub(crate) friction: f64,
     /// Directions from the site's center to the contact point at the beginning and at the end of
     /// the step, body axes.
@@ -163,6 +168,7 @@ impl ContactPoint {
             probe: None,
             rigid: None,
             support: None,
+            indent: None,
             friction,
             first: zero,
             last: zero,
@@ -192,6 +198,12 @@ impl ContactPoint {
         }
     }
 
+    /// The sites that carry the point, with their weights.
+    pub(crate) fn carriers(&self) -> impl Iterator<Item = (usize, f64)> + Clone + '_ {
+        let alone = self.indent.is_none().then_some((self.site, 1.0));
+        alone.into_iter().chain(self.indent.iter().flat_map(|indent| indent.carriers.iter()))
+    }
+
     /// Force of the last computed step, N, world axes.
     pub(crate) fn world_force(&self) -> Vector3<f64> {
         self.axes.tr_mul(&self.pushed)
@@ -199,7 +211,46 @@ impl ContactPoint {
 
     /// Energy in the compliance under a force, J.
     pub(crate) fn stored(&self, force: &Vector3<f64>) -> f64 {
-        0.5 * force.dot(&(self.compliance * force))
+        let linear = |force: &Vector3<f64>| 0.5 * force.dot(&(self.compliance * force));
+        let Some(indent) = &self.indent else { return linear(force) };
+        let normal = self.axes.row(0).transpose();
+        let along = normal.dot(force);
+        linear(force) - linear(&(along * normal)) + indent.energy(along)
+    }
+
+    /// Takes the tangent of the dent at a force along the normal (N).
+    pub(crate) fn linearize(&mut self, force: f64) {
+        let normal = self.axes.row(0).transpose();
+        if let Some(indent) = &mut self.indent {
+            let shift = indent.shift;
+            self.compliance = indent.linearize(&normal, force);
+            self.off[0] += indent.shift - shift;
+            self.local = self.axes * self.compliance * self.axes.transpose();
+        }
+    }
+
+    /// Distance by which the dent differs from its tangent at the force of the solve, m.
+    pub(super) fn bends(&self) -> f64 {
+        let dent = |indent: &Indent| indent.dent(self.force[0]).0 - indent.shift;
+        self.indent.as_ref().map_or(0.0, |indent| (dent(indent) - self.local[(0, 0)] * self.force[0]).abs())
+    }
+
+    /// Work that a force (N, world axes) does on the contact point beyond that on the material of
+    /// the first one, J. Where a ball rolls, its material leaves the other surface, and the contact
+    /// point does not.
+    pub(crate) fn rolled(&self, force: &Vector3<f64>) -> f64 {
+        let Some(indent) = &self.indent else { return 0.0 };
+        let normal = self.axes.row(0).transpose();
+        let begun = self.gap - indent.dent(normal.dot(&self.before)).0;
+        let ended = self.off[0] - indent.shift + self.floor;
+        let material = normal.dot(&(self.end - self.start - self.carried));
+        normal.dot(force) * (ended - begun - material)
+    }
+
+    /// Dent of the surface under a force, m, world axes.
+    pub(crate) fn dent(&self, force: &Vector3<f64>) -> Vector3<f64> {
+        let shift = self.indent.as_ref().map_or(0.0, |indent| indent.shift);
+        self.compliance * force + shift * self.axes.row(0).transpose()
     }
 
     /// Turns the axes to a normal. The forces keep their direction in the world.

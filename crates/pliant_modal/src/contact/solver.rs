@@ -93,6 +93,9 @@ impl Touching {
     /// Largest number of steps of Newton's method.
     const DESCENTS: usize = 24;
 
+    /// Largest number of tangents of a dent in one solve.
+    const TANGENTS: usize = 4;
+
     /// Largest number of coordinates, and of multiplications, of a direct solve.
     const MAX_WIDTH: usize = 512;
     const MAX_WORK: usize = 4_000_000;
@@ -214,13 +217,43 @@ impl Touching {
         if count > 0.0 && ratio.is_finite() { ratio } else { 0.0 }
     }
 
+    /// Takes the tangents of the dents of points that begin to touch at about the forces that they
+    /// will have.
+    pub(crate) fn begin_dents(&mut self) {
+        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
+            let Some(indent) = point.indent.filter(|_| point.pushed[0] <= 0.0) else { continue };
+            let gap = point.off[0] - indent.shift;
+            let mut response = 0.0;
+            for side in sides.iter().flatten() {
+                let row = &self.rows[side.rows..][..self.spans[side.member].width];
+                response += dot(row, row);
+            }
+            point.linearize(if gap < 0.0 { indent.first_force(gap, response) } else { 0.0 });
+        }
+    }
+
+    /// Solves the laws of all points on the responses of the bodies, which are linear. Dents that
+    /// are not are solved by their tangents, again and again.
+    pub(crate) fn solve(&mut self, enough: f64) {
+        self.points.iter_mut().for_each(|point| point.force = point.pushed);
+        for _ in 0..Self::TANGENTS {
+            self.solve_linear(enough);
+            if self.points.iter().map(ContactPoint::bends).fold(0.0, f64::max) <= enough {
+                return;
+            }
+            for point in &mut self.points {
+                point.linearize(point.force[0]);
+            }
+        }
+    }
+
     /// Solves the laws of all points on the linearized responses.
     ///
     /// Block Gauss-Seidel sweeps go forward and backward in turn and find which points are open,
     /// stick or slide. After every few sweeps a direct solve takes that as given, which removes the
     /// slowly converging part of the error. The work ends early once no force of a sweep moves a
     /// site by more than `enough` (m).
-    pub(crate) fn solve(&mut self, enough: f64) {
+    fn solve_linear(&mut self, enough: f64) {
         for (point, sides) in self.points.iter_mut().zip(&self.sides) {
             point.block = point.local;
             for side in sides.iter().flatten() {
@@ -228,7 +261,6 @@ impl Touching {
                 let row = |axis: usize| &self.rows[side.rows + axis * width..][..width];
                 point.block += Matrix3::from_fn(|i, j| dot(row(i.min(j)), row(i.max(j))));
             }
-            point.force = point.pushed;
         }
         self.sum_changes();
         let few = 3 * self.points.len() <= self.width();

@@ -109,6 +109,13 @@ pub(crate) struct Carriers {
 }
 
 impl Carriers {
+    /// The first of some sites with their weights, without those of no weight.
+    pub(crate) fn new(sites: impl Iterator<Item = (usize, f64)>) -> Self {
+        let mut all = Self { list: [(0, 0.0); MAX_CARRIERS], count: 0 };
+        sites.filter(|(_, weight)| *weight != 0.0).for_each(|(site, weight)| all.add(site as u32, weight));
+        all
+    }
+
     fn add(&mut self, site: u32, weight: f64) {
         if let Some(entry) = self.list[..self.count].iter_mut().find(|(known, _)| *known == site) {
             entry.1 += weight;

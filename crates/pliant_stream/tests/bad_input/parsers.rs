@@ -151,6 +151,7 @@ fn obstacles_and_contacts_that_are_none_are_refused() {
         ContactState { memory: vec![memory; 2], ..contacts() },
         ContactState { memory: vec![ContactMemory { force: [f64::NAN; 3], ..memory }], ..contacts() },
         ContactState { memory: vec![ContactMemory { toward: [2.0, 0.0, 0.0], ..memory }], ..contacts() },
+        ContactState { memory: vec![ContactMemory { leads: Some(-1.0), ..memory }], ..contacts() },
         ContactState { weight: 2.0, ..contacts() },
         ContactState { lost: -1.0, ..contacts() },
     ] {

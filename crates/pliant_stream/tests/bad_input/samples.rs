@@ -83,6 +83,7 @@ pub(super) fn contacts() -> ContactState {
         force: [0.0, 2.0, 0.5],
         anchor: [0.5; 3],
         toward: [0.0; 3],
+        leads: (site % 2 == 0).then_some(1e-3),
     };
     ContactState { weight: 0.75, lost: 0.5, memory: vec![memory(3), memory(9)] }
 }

@@ -76,7 +76,7 @@ pub(crate) trait Member {
 
 impl<'a> View<'a> {
     /// Whether the frame moves.
-    fn moves(&self) -> bool {
+    pub(super) fn moves(&self) -> bool {
         self.kernel.model.is_free() && self.load.frame.is_none()
     }
 
@@ -286,6 +286,7 @@ impl<P: Member> Group<'_, P> {
         }
         report.guarded |= self.stop_torn(work);
         report.guarded |= self.cap_energy(work);
+        points::drill(self, work);
         report.sweeps = work.sweeps;
         self.end(work, theta.unwrap_or(0.5), &report);
         Ok(())
@@ -332,8 +333,7 @@ impl<P: Member> Group<'_, P> {
                         kernel.add_push(sites, carriers.iter(), &tangent, &point.arm, &force);
                     } else {
                         let tangent = point.mean.unwrap_or(point.tangent);
-                        let site = std::iter::once((point.site, 1.0));
-                        kernel.add_push(sites, site, &tangent, &point.arm, &force);
+                        kernel.add_push(sites, point.carriers(), &tangent, &point.arm, &force);
                     }
                 }
             }
@@ -401,6 +401,7 @@ impl<P: Member> Group<'_, P> {
             }
             self.set_arms(work, weight);
             self.fill_rows(work);
+            work.begin_dents();
             if theta.is_none() && recovers {
                 let ratio = work.rigid_share();
                 // A soft contact is stepped nearly without loss. A stiff one would ring.
@@ -454,9 +455,7 @@ impl<P: Member> Group<'_, P> {
                     let rows = &mut work.rows[side.rows..][..3 * width];
                     match point.probe.as_ref().and_then(|probe| probe.first.as_ref()) {
                         Some((_, carriers)) => view.kernel.fill_rows(sites, carriers.iter(), &of, rows),
-                        None => {
-                            view.kernel.fill_rows(sites, std::iter::once((point.site, 1.0)), &of, rows);
-                        }
+                        None => view.kernel.fill_rows(sites, point.carriers(), &of, rows),
                     }
                 }
                 if let (Some(far), Some(side)) = (&point.far, &sides[1])

@@ -17,12 +17,14 @@ use crate::{
 
 mod begin;
 mod detect;
+mod drill;
 mod pass;
 mod probes;
 mod rigid;
 
 pub(super) use begin::begin;
 pub(super) use detect::detect;
+pub(super) use drill::drill;
 use pass::march;
 pub(super) use probes::{begin_probes, detect_probes, keep_at_probe};
 pub(super) use rigid::{begin_supports, fill_rows, respond, set_arms, support, take_supports, write_forces};
@@ -34,6 +36,15 @@ pub(super) const RECOVERY_SPEED: f64 = 0.5;
 /// Depth below the surface of another body down to which sites are pushed out, as a share of the
 /// size of the smaller body.
 const DEEP: f64 = 0.1;
+
+/// Largest radius of a contact that is at one place when a ball begins to touch, as a share of the
+/// ball's radius. Softer or faster balls touch with all of their sites, until they touch no more.
+const NARROW: f64 = 0.35;
+
+/// Distance of two directions from the center of a ball below which they are those of one contact.
+/// A contact of the widest circle has sites that are deep up to half of the radius beside its
+/// place.
+const NEAR: f64 = 0.6;
 
 fn carried(obstacle: &dyn ObstacleShape, point: &Vector3<f64>, h: f64) -> Result<Vector3<f64>, StepError> {
     let velocity = obstacle.velocity(point);
@@ -131,7 +142,7 @@ fn locate_at_body(
     }
     let found = SurfacePoint { distance: near.distance, normal: near.normal };
     let (_, tangent) = own.site(index, &site.outward);
-    Ok((Located { tangent, toward, center, point, found }, near))
+    Ok((Located { tangent, toward, wanted: Vector3::zeros(), center, point, found }, near))
 }
 
 /// Takes the gaps of all points at the end of the computed step. Where forces act over the step is
@@ -152,7 +163,8 @@ pub(super) fn linearize<P: Member>(
             continue;
         }
         let view = group.view(point.member);
-        let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { continue };
+        let Some(sites) = view.sites() else { continue };
+        let Some(site) = sites.sites.get(point.site) else { continue };
         let (kernel, state) = (view.kernel, view.state);
         let mut size = kernel.model.size();
         let own = kernel.site_compliance(site, &state.frame, &state.q);
@@ -160,7 +172,9 @@ pub(super) fn linearize<P: Member>(
             (Touched::Obstacle(index), _) => {
                 let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
                 let obstacle = rigid::pushed(group, &**obstacle);
-                let located = kernel.locate(site, &obstacle, &state.frame, &state.q)?;
+                let leads = point.indent.as_ref().map(|indent| &indent.carriers);
+                let at = (sites, site);
+                let located = kernel.locate(at, &obstacle, &state.frame, &state.q, leads)?;
                 let (mut distance, mut normal) = (located.found.distance, located.found.normal);
                 if point.passed {
                     // The site passed through: it is as far behind the place where it went in as it
@@ -220,7 +234,9 @@ pub(super) fn linearize<P: Member>(
         point.place = located.point;
         point.end = state.frame.to_world(located.center + site.radius * point.first);
         let offset = point.axes * (point.end - point.anchor);
-        point.off = Vector3::new(distance - point.floor, offset[1], offset[2]);
+        let shift = point.indent.map_or(0.0, |indent| indent.shift);
+        point.off = Vector3::new(distance - point.floor + shift, offset[1], offset[2]);
+        point.linearize(point.pushed[0]);
         // The middle of the step gives the work of a force on a shape that bends. With the mean and
         // the arm of every round the rounds of a soft or heavily loaded body would not converge.
         let start = point.tangent;
@@ -257,7 +273,7 @@ fn follow(
         }
         let found = SurfacePoint { distance: near.distance, normal: near.normal };
         let center = own.frame.to_local(&middle);
-        (Located { tangent, toward, center, point, found }, near)
+        (Located { tangent, toward, wanted: Vector3::zeros(), center, point, found }, near)
     });
     far.place = near.place;
     if far.mean.is_none() {

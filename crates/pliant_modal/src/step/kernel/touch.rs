@@ -10,10 +10,19 @@ use nalgebra::{Matrix3, Vector3};
 use super::Kernel;
 use crate::{
     ModalModel, StepError,
-    contact::{Cloud, ContactSites, Contacts, ObstacleShape, Shape, Site, Sixes, SurfacePoint},
+    contact::{
+        Carriers, Cloud, ContactSites, Contacts, Indent, ObstacleShape, Shape, Site, Sixes, SurfacePoint,
+    },
     simd::dot,
     step::{Frame, Hand, Six, State, Tangent, tangent},
 };
+
+/// Smallest and largest curvature of both surfaces together, as a multiple of that of the ball: in
+/// a hollow that fits the contact is as wide as the ball, and a needle is no point.
+const CURVED: [f64; 2] = [0.1, 100.0];
+
+/// Radius of the contact of a ball without force, as a multiple of the spacing of the sites.
+const SMALLEST: f64 = 0.02;
 
 /// Contact forces on a body over a step.
 #[derive(Debug, Clone, Default)]
@@ -61,6 +70,8 @@ pub(super) struct Located {
     /// Derivative of the position, world axes.
     pub(super) tangent: Tangent,
     pub(super) toward: Vector3<f64>,
+    /// Direction from the center to the obstacle, body axes. Zero for a site that is not round.
+    pub(super) wanted: Vector3<f64>,
     /// Displaced center of the site, m, body axes.
     pub(super) center: Vector3<f64>,
     pub(super) point: Vector3<f64>,
@@ -100,40 +111,64 @@ impl Kernel {
         Ok(())
     }
 
+    /// Displacement of a site, or of the place of a ball that it leads, m, and its derivative by
+    /// the six numbers, body axes.
+    fn moved(
+        &self,
+        sites: &ContactSites,
+        site: &Site,
+        leads: Option<&Carriers>,
+        q: &[f64],
+    ) -> (Vector3<f64>, Tangent) {
+        let warp = self.warps();
+        let six = match leads {
+            Some(carriers) => carriers
+                .iter()
+                .filter_map(|(site, weight)| Some((sites.sites.get(site)?, weight)))
+                .map(|(site, weight)| weight * site.patch.rows().reduce(q, warp))
+                .sum(),
+            None => site.patch.rows().reduce(q, warp),
+        };
+        tangent(&six, warp)
+    }
+
+    /// Finds the place where a site is nearest to an obstacle. The contact point of one that leads
+    /// its ball slides over all that is nearest to it.
     pub(super) fn locate(
         &self,
-        site: &Site,
+        (sites, site): (&ContactSites, &Site),
         obstacle: &dyn ObstacleShape,
         frame: &Frame,
         q: &[f64],
+        leads: Option<&Carriers>,
     ) -> Result<Located, StepError> {
-        let warp = self.warps();
-        let (moved, tangent) = tangent(&site.patch.rows().reduce(q, warp), warp);
+        let (moved, tangent) = self.moved(sites, site, leads, q);
         let turn: Matrix3<f64> = *frame.rotation().to_rotation_matrix().matrix();
         let tangent = turn * tangent;
         let center = site.center + moved;
         let mut point = frame.to_world(center);
         let mut found = look(obstacle, &point)?;
-        let mut toward = Vector3::zeros();
+        let (mut toward, mut wanted) = (Vector3::zeros(), Vector3::zeros());
         if site.radius > 0.0 {
-            toward = site.toward(&-(frame.rotation().inverse() * found.normal));
+            wanted = -(frame.rotation().inverse() * found.normal);
+            toward = if leads.is_some() { site.leading(&wanted) } else { site.toward(&wanted) };
             point = frame.to_world(center + site.radius * toward);
             found = look(obstacle, &point)?;
         }
-        Ok(Located { tangent, toward, center, point, found })
+        Ok(Located { tangent, toward, wanted, center, point, found })
     }
 
     /// Position of a site's material point in the direction `toward`, m, and its derivative, world
     /// axes.
     pub(super) fn material(
         &self,
-        site: &Site,
+        (sites, site): (&ContactSites, &Site),
         toward: &Vector3<f64>,
         frame: &Frame,
         q: &[f64],
+        leads: Option<&Carriers>,
     ) -> (Vector3<f64>, Tangent) {
-        let warp = self.warps();
-        let (moved, tangent) = tangent(&site.patch.rows().reduce(q, warp), warp);
+        let (moved, tangent) = self.moved(sites, site, leads, q);
         let turn: Matrix3<f64> = *frame.rotation().to_rotation_matrix().matrix();
         (frame.to_world(site.rest(toward) + moved), turn * tangent)
     }
@@ -145,6 +180,21 @@ impl Kernel {
             turn *= site.patch.rotation(q);
         }
         turn * (site.patch.residual() / self.settings.stiffness_scale) * turn.transpose()
+    }
+
+    /// The law of the dent of a ball that touches an obstacle at one place.
+    pub(super) fn indent(
+        &self,
+        (sites, index): (&ContactSites, usize),
+        carriers: Carriers,
+        obstacle: &dyn ObstacleShape,
+    ) -> Option<Indent> {
+        let site = sites.sites.get(index)?;
+        let soft = sites.softness(site.ball.as_ref()?, &carriers);
+        let [least, most] = CURVED.map(|times| times / site.radius);
+        let radius = 1.0 / (1.0 / site.radius + obstacle.curvature()).max(least).min(most);
+        let (scale, smallest) = (self.settings.stiffness_scale, SMALLEST * sites.spacing);
+        Some(Indent::new(carriers, &soft, scale, radius, smallest))
     }
 
     /// A root of the inverse inertia of the frame, world axes.

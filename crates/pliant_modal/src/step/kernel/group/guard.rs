@@ -166,7 +166,7 @@ pub(super) fn gained(work: &Touching, recovers: bool) -> bool {
     let (mut done, mut allowed, mut scale) = (0.0, 0.0, 0.0f64);
     for point in &work.points {
         let force = point.world_force();
-        let along = force.dot(&(point.end - point.start - point.carried));
+        let along = force.dot(&(point.end - point.start - point.carried)) + point.rolled(&force);
         // A dent that turns with the site is no work of the contact.
         let (stored, before) = (point.stored(&force), point.stored(&point.before));
         done += along + stored - before;

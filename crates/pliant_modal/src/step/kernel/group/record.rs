@@ -1,6 +1,6 @@
 //! What a step with contacts keeps: for the next step, and for users to read.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 
 use super::{Group, Member};
 use crate::{
@@ -53,13 +53,14 @@ impl<P: Member> Group<'_, P> {
         let held = point.pushed[1].hypot(point.pushed[2]);
         let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
         let normal = point.axes.row(0).transpose();
-        let dent = point.compliance * force;
-        let penetration = (-(point.off[0] + point.floor + normal.dot(&dent))).max(0.0);
-        let add = |contacts: &mut Contacts, contact: Contact, compliance: &Matrix3<f64>| {
+        let dent = point.dent(force);
+        let shift = point.indent.map_or(0.0, |indent| indent.shift);
+        let penetration = (-(point.off[0] - shift + point.floor + normal.dot(&dent))).max(0.0);
+        let add = |contacts: &mut Contacts, contact: Contact, energy: f64| {
             let report = &mut contacts.report;
             report.force = (Vector3::from(report.force) + Vector3::from(contact.force)).into();
             report.penetration = report.penetration.max(penetration);
-            report.energy += 0.5 * force.dot(&(compliance * force));
+            report.energy += energy;
             contacts.list.push(contact);
         };
         let mut contact = Contact {
@@ -76,7 +77,7 @@ impl<P: Member> Group<'_, P> {
             let sites = self.view(point.member).sites();
             let site = carriers.largest().and_then(|site| sites?.sites.get(site));
             contact.vertex = site.map_or(0, |site| site.vertex);
-            add(self.parts(point.member).contacts, contact, &point.compliance);
+            add(self.parts(point.member).contacts, contact, point.stored(force));
             return;
         }
         let view = self.view(point.member);
@@ -102,12 +103,13 @@ impl<P: Member> Group<'_, P> {
             anchor = self.rigids[at.rigid].to_local(&anchor, self.h);
         }
         let (anchor, vertex) = far.unwrap_or((anchor, 0));
-        let own = point.compliance - point.far.map_or_else(Matrix3::zeros, |far| far.compliance);
+        let theirs = point.far.map_or(0.0, |far| 0.5 * force.dot(&(far.compliance * force)));
         let contacts = self.parts(point.member).contacts;
         let place = point.far.map(|far| far.place);
         let (other, site) = (point.other, point.site);
-        contacts.memory.push(Memory { other, site, force: *force, anchor, toward, place });
-        add(contacts, contact, &own);
+        let leads = point.indent.is_some().then(|| point.stored(force).max(0.0));
+        contacts.memory.push(Memory { other, site, force: *force, anchor, toward, place, leads });
+        add(contacts, contact, point.stored(force) - theirs);
         if let Some(far) = &point.far {
             let opposite = Contact {
                 other: Touched::Body(key),
@@ -116,7 +118,7 @@ impl<P: Member> Group<'_, P> {
                 force: (-force).into(),
                 ..contact
             };
-            add(self.parts(far.member).contacts, opposite, &far.compliance);
+            add(self.parts(far.member).contacts, opposite, theirs);
         }
     }
 }

@@ -9,7 +9,9 @@ use super::super::{
 use super::{DEEP, carried, far_compliance, far_side, find, friction, locate_at_body, rigid};
 use crate::{
     StepError,
-    contact::{ContactPoint, Guess, Memory, ObstacleShape, Shape, Site, Touched, Touching},
+    contact::{
+        Carriers, ContactPoint, ContactSites, Guess, Memory, ObstacleShape, Shape, Site, Touched, Touching,
+    },
 };
 
 /// Farthest distance of a site's surface from its anchor, as a share of the body's size. Beyond it
@@ -23,12 +25,26 @@ pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touchi
         let view = group.view(member);
         let Some(sites) = view.sites() else { continue };
         for memory in &view.contacts.memory {
-            let Some(site) = sites.sites.get(memory.site) else { continue };
+            let Some(mut site) = sites.sites.get(memory.site) else { continue };
             match memory.other {
                 Touched::Probe(_) => {}
                 Touched::Obstacle(index) => {
                     let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
-                    work.points.push(begin_at_obstacle(group, member, memory, site, &**obstacle)?);
+                    let mut memory = *memory;
+                    let leads = leader(group, member, sites, &memory, &**obstacle)?;
+                    if let Some((leader, _)) = leads.filter(|(leader, _)| *leader != memory.site) {
+                        // Another site of the ball takes over.
+                        let same = |m: &Memory| m.other == memory.other && m.site == leader;
+                        let taken = |p: &ContactPoint| {
+                            p.member == member && p.other == memory.other && p.site == leader
+                        };
+                        if view.contacts.memory.iter().any(same) || work.points.iter().any(taken) {
+                            continue;
+                        }
+                        (memory.site, site) = (leader, &sites.sites[leader]);
+                    }
+                    let place = (member, sites, leads.map(|(_, carriers)| carriers));
+                    work.points.push(begin_at_obstacle(group, place, &memory, site, &**obstacle)?);
                 }
                 Touched::Body(key) => {
                     let Some(other) = find(group, key) else { continue };
@@ -46,9 +62,27 @@ pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touchi
     Ok(())
 }
 
-fn begin_at_obstacle<P: Member>(
+/// The site that leads the ball at which a contact goes on, and those that carry it. `None` for a
+/// contact of one site.
+fn leader<P: Member>(
     group: &Group<'_, P>,
     member: usize,
+    sites: &ContactSites,
+    memory: &Memory,
+    obstacle: &dyn ObstacleShape,
+) -> Result<Option<(usize, Carriers)>, StepError> {
+    let site = &sites.sites[memory.site];
+    let Some(ball) = site.ball.filter(|ball| ball.leads && memory.leads.is_some()) else { return Ok(None) };
+    let kernel = group.view(member).kernel;
+    let (frame, q) = (&kernel.before.frame, &kernel.before.q);
+    let located = kernel.locate((sites, site), obstacle, frame, q, None)?;
+    let carriers = sites.carriers(&ball, &located.wanted, memory.site);
+    Ok(Some((sites.leader(&ball, &located.wanted, memory.site), carriers)))
+}
+
+fn begin_at_obstacle<P: Member>(
+    group: &Group<'_, P>,
+    (member, sites, leads): (usize, &ContactSites, Option<Carriers>),
     memory: &Memory,
     site: &Site,
     obstacle: &dyn ObstacleShape,
@@ -56,12 +90,16 @@ fn begin_at_obstacle<P: Member>(
     let view = group.view(member);
     let kernel = view.kernel;
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
-    let located = kernel.locate(site, obstacle, frame, q)?;
+    let at = (sites, site);
+    let located = kernel.locate(at, obstacle, frame, q, leads.as_ref())?;
     let mut point = ContactPoint::new(member, memory.site, memory.other, view.contacts.friction());
     (point.first, point.last) = (memory.toward, located.toward);
-    (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
+    (point.start, point.tangent) = kernel.material(at, &memory.toward, frame, q, leads.as_ref());
     point.carried = carried(obstacle, &located.point, kernel.h)?;
     point.compliance = kernel.site_compliance(site, frame, q);
+    if let Some(carriers) = leads {
+        point.indent = kernel.indent((sites, memory.site), carriers, obstacle);
+    }
     point.gap = look(obstacle, &(located.point + point.carried))?.distance;
     point.arm = located.point - Vector3::from(frame.center());
     // What sticks to a rigid body goes where that body goes.
@@ -70,6 +108,11 @@ fn begin_at_obstacle<P: Member>(
     let (carried, farthest) = (point.carried, SNAPPED * kernel.model.size());
     let normal = &located.found.normal;
     resume(&mut point, memory.force, normal, anchor + carried, carried, farthest);
+    if let (Some(stored), true) = (memory.leads, point.indent.is_some()) {
+        // The law differs a little from place to place on a ball.
+        let here = point.stored_before.max(0.0);
+        point.stored_before = stored.clamp(0.5 * here, 2.0 * here);
+    }
     point.rigid = rigid::side(group, obstacle, &point, point.carried);
     Ok(point)
 }
@@ -123,8 +166,9 @@ pub(super) fn resume(
     point.turn(normal);
     point.pushed = point.axes * force;
     point.force = point.pushed;
+    point.linearize(point.pushed[0]);
     point.stored_before = point.stored(&force);
-    let dent = point.compliance * force;
+    let dent = point.dent(&force);
     point.gap += normal.dot(&dent);
     let unslipped = point.start + dent + carried;
     let slip = anchor - unslipped;

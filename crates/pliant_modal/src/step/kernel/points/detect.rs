@@ -4,10 +4,10 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::super::{
     group::{Group, Member, View},
-    touch::look,
+    touch::{Located, look},
 };
 use super::pass::{PARTS, march, pass};
-use super::{DEEP, carried, far_compliance, far_side, friction, locate_at_body, rigid, share};
+use super::{DEEP, NARROW, NEAR, carried, far_compliance, far_side, friction, locate_at_body, rigid, share};
 use crate::{
     StepError,
     contact::{Clearance, ContactPoint, ContactSites, Guess, Look, ObstacleShape, Touched, Touching},
@@ -170,6 +170,7 @@ fn detect_at_obstacle<P: Member>(
     let other = Touched::Obstacle(index);
     let stamp = mark(work, member, other);
     let cloud = view.contacts.cloud(&state.q);
+    let mut directions = Directions::default();
     for (number, site) in sites.sites.iter().enumerate() {
         if work.marks[number] == stamp {
             continue;
@@ -194,8 +195,33 @@ fn detect_at_obstacle<P: Member>(
             }
         }
         *candidates += 1;
-        let located = kernel.locate(site, obstacle, to, &state.q)?;
-        let (start, tangent) = kernel.material(site, &located.toward, from, &before.q);
+        let mut located = kernel.locate((sites, site), obstacle, to, &state.q, None)?;
+        let mut leads = None;
+        if let Some(ball) = &site.ball {
+            let wanted = directions.of(ball.number, located.wanted);
+            let [reached, nearest] = sites.leads(ball, &wanted, number);
+            if reached {
+                match known(work, (member, other), sites, ball.number, &wanted) {
+                    // The ball touches here already.
+                    Some(true) => continue,
+                    Some(false) => {}
+                    None if is_narrow(view, sites, ball.number, site.radius, free, &located) => {
+                        if !nearest {
+                            continue;
+                        }
+                        let carriers = sites.carriers(ball, &wanted, number);
+                        let at = (sites, site);
+                        let led = kernel.locate(at, obstacle, to, &state.q, Some(&carriers))?;
+                        if led.found.distance < band {
+                            (located, leads) = (led, Some(carriers));
+                        }
+                    }
+                    None => {}
+                }
+            }
+        }
+        let (start, tangent) =
+            kernel.material((sites, site), &located.toward, from, &before.q, leads.as_ref());
         let moved = located.point - start;
         let mut found = located.found;
         let mut hit = false;
@@ -218,6 +244,7 @@ fn detect_at_obstacle<P: Member>(
         let way = located.point - start - point.carried;
         point.anchor = start + point.carried + share(point.gap, found.distance) * way;
         point.rigid = rigid::side(group, free, &point, by_itself);
+        point.indent = leads.and_then(|carriers| kernel.indent((sites, number), carriers, free));
         if hit {
             // The plane at the place where the site went in.
             point.turn(&found.normal);
@@ -227,6 +254,76 @@ fn detect_at_obstacle<P: Member>(
         work.points.push(point);
     }
     Ok(())
+}
+
+/// Directions from the centers of balls to an obstacle, body axes. All sites of a ball must agree
+/// on which of them leads, and each has its own displacement.
+#[derive(Default)]
+struct Directions {
+    list: [(usize, Vector3<f64>); 8],
+    count: usize,
+}
+
+impl Directions {
+    /// The direction in which a site of the ball was found first, if it is near this one.
+    fn of(&mut self, ball: usize, wanted: Vector3<f64>) -> Vector3<f64> {
+        let near = |(of, known): &&(usize, Vector3<f64>)| *of == ball && (known - wanted).norm() < NEAR;
+        if let Some((_, known)) = self.list[..self.count].iter().find(near) {
+            return *known;
+        }
+        if let Some(entry) = self.list.get_mut(self.count) {
+            *entry = (ball, wanted);
+            self.count += 1;
+        }
+        wanted
+    }
+}
+
+/// How a ball touches an obstacle already near the direction `wanted` from its center (body axes):
+/// at one place, with its sites, or not at all.
+fn known(
+    work: &Touching,
+    (member, other): (usize, Touched),
+    sites: &ContactSites,
+    ball: usize,
+    wanted: &Vector3<f64>,
+) -> Option<bool> {
+    let same = |point: &&ContactPoint| {
+        let is_of = || {
+            let of = sites.sites.get(point.site).and_then(|site| site.ball);
+            of.is_some_and(|of| of.leads && of.number == ball)
+        };
+        point.member == member && point.other == other && (point.last - wanted).norm() < NEAR && is_of()
+    };
+    work.points.iter().filter(same).map(|point| point.indent.is_some()).reduce(|a, b| a || b)
+}
+
+/// Whether a ball that begins to touch will touch at one place: under the weight of the body, and
+/// by its speed (K. L. Johnson, *Contact Mechanics*, 1985, 11.4) with all of its mass behind it.
+fn is_narrow(
+    view: &View<'_>,
+    sites: &ContactSites,
+    ball: usize,
+    radius: f64,
+    obstacle: &dyn ObstacleShape,
+    located: &Located,
+) -> bool {
+    let (kernel, model) = (view.kernel, &view.kernel.model);
+    if !model.is_free() {
+        return false;
+    }
+    let normal = &located.found.normal;
+    let theirs = obstacle.velocity(&located.point);
+    let frame = &kernel.before.frame;
+    let arm = located.point - Vector3::from(frame.center());
+    let own = Vector3::from(frame.velocity()) + frame.angular_velocity(model).cross(&arm);
+    let speed = normal.dot(&(own - theirs));
+    let speed = if speed < 0.0 { speed } else { 0.0 };
+    let weight = model.mass() * Vector3::from(kernel.settings.gravity).norm();
+    let plain = kernel.settings.stiffness_scale / (std::f64::consts::PI * sites.balls[ball].slope[0]);
+    let resting = (0.75 * weight * radius / plain).cbrt();
+    let depth = (15.0 * model.mass() * speed * speed / (16.0 * radius.sqrt() * plain)).powf(0.4);
+    resting < NARROW * radius && (radius * depth).sqrt() < NARROW * radius
 }
 
 fn detect_at_body<P: Member>(

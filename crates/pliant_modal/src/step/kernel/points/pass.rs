@@ -32,7 +32,8 @@ pub(super) fn pass(
     let middle = to - own.frame.rotation() * (site.radius * site.outward);
     let found = SurfacePoint { distance: near.distance, normal: near.normal };
     let toward = if site.radius > 0.0 { site.outward } else { Vector3::zeros() };
-    let located = Located { tangent, toward, center: own.frame.to_local(&middle), point: to, found };
+    let wanted = Vector3::zeros();
+    let located = Located { tangent, toward, wanted, center: own.frame.to_local(&middle), point: to, found };
     (near.distance < 0.0).then_some((located, near))
 }
 
