@@ -1,19 +1,28 @@
-//! The haptic loop on a virtual device in virtual time: known limits, and a body dragged by stiff,
-//! loose and absent hands.
+//! The haptic loop on a virtual device in virtual time: known limits, a body dragged by stiff, loose
+//! and absent hands, and one that is held without any friction in the device.
 
 use std::{collections::VecDeque, sync::Arc};
 
+use nalgebra::{Matrix3, Vector3};
 use pliant_haptics::{
     Cycle, HandModel, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModelWriter, SafetyConfig, ToolContact,
     ToolMap, VirtualConfig, VirtualDevice, VirtualScheduler,
 };
 use pliant_modal::{Body, BodyConfig, GrabConfig};
 
-use super::{Bound, Case, CaseOutcome, bodies::BarBody};
+use super::{
+    Bound, Case, CaseOutcome,
+    bodies::BarBody,
+    solid::{Solid, lame},
+};
 use crate::LabError;
 
 /// Periods a second of the device loop.
 const RATE: f64 = 1000.0;
+/// Steps a second of the simulation, if no other is named.
+const STEPS: f64 = 120.0;
+/// Time from the tool to the simulation and back over a network, s.
+const FAR: f64 = 0.196;
 /// Largest energy that the loop may give beyond its supply, J: the capacity of its tank.
 const TANK: f64 = 5e-3;
 
@@ -24,10 +33,14 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
     for young in [1e3, 1e5, 1e7, 1e11] {
         for (grip, hand) in HandModel::PRESETS {
-            for round_trip in [0.0, 0.196] {
+            for round_trip in [0.0, FAR] {
                 let far = if round_trip > 0.0 { ", 196 ms away" } else { "" };
                 let name = format!("E {young:.0e} Pa, grip {grip}{far}, 120 Hz");
-                out.push(Case::new("device", name, move || drag(young, hand, 120.0, round_trip)));
+                out.push(Case::new("device", name, move || drag(young, hand, STEPS, round_trip)));
+                if young > 1e3 {
+                    let name = format!("no friction, E {young:.0e} Pa, grip {grip}{far}, 120 Hz");
+                    out.push(Case::new("device", name, move || hold(young, hand, round_trip)));
+                }
             }
         }
     }
@@ -84,10 +97,17 @@ fn sampled_spring(mass: f64, damping: f64) -> Result<CaseOutcome, LabError> {
     Ok(CaseOutcome::of(vec![Bound::new("|stiffest calm spring / (2 b / T) - 1|", low / want - 1.0, 3e-3)]))
 }
 
+/// The bar that is dragged.
+fn dragged(young: f64) -> BarBody {
+    BarBody { young, length: 0.15, modes: 12, zeta: 0.05, ..BarBody::default() }
+}
+
 /// A body stepped at the game's rate, a network with a fixed delay, and the device loop with a
-/// virtual Touch.
+/// virtual device.
 struct DeviceScene {
     body: Body,
+    /// Where the tool is when it does not deform the body, m.
+    origin: Vector3<f64>,
     held: HeldGrab,
     writer: ModelWriter,
     cycle: Cycle<VirtualDevice>,
@@ -106,8 +126,14 @@ struct DeviceScene {
 }
 
 impl DeviceScene {
-    fn new(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result<Self, LabError> {
-        let bar = BarBody { young, length: 0.15, modes: 12, zeta: 0.05, ..BarBody::default() };
+    fn new(
+        device: VirtualConfig,
+        young: f64,
+        hand: HandModel,
+        simulation: f64,
+        round_trip: f64,
+    ) -> Result<Self, LabError> {
+        let bar = dragged(young);
         let model = bar.bake()?;
         let patch = bar.tip(&model)?;
         let step = 1.0 / simulation;
@@ -116,12 +142,13 @@ impl DeviceScene {
         // The middle of the workspace lies on the patch, so that grabbing moves nothing.
         let origin = body.grab_position(probe)?;
         body.release(probe);
-        let device = VirtualDevice::new(VirtualConfig::touch(), hand)?;
+        let device = VirtualDevice::new(device, hand)?;
         let tool = ToolMap { origin, ..ToolMap::default() };
         let cycle = Cycle::new(device, LoopConfig { rate: RATE, round_trip, tool, ..LoopConfig::default() })?;
         let id = body.grab(&patch, cycle.core().coupling().grab_config(1.0, 1.0))?;
         Ok(Self {
             body,
+            origin: origin.into(),
             held: HeldGrab { key: 0, id, offset: [0.0; 3] },
             writer: ModelWriter::new(),
             cycle,
@@ -181,10 +208,9 @@ impl DeviceScene {
     }
 }
 
-/// Drags the tool 3 cm to the side within half a second and holds it there. Without a hand, the
-/// free device gets an initial velocity instead.
-fn drag(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result<CaseOutcome, LabError> {
-    let mut scene = DeviceScene::new(young, hand, simulation, round_trip)?;
+/// Leads the arm `to` (m) within half a second and lets the device come to rest. Without a hand, the
+/// free device gets an initial velocity instead. Returns the bounds on what it does.
+fn led(scene: &mut DeviceScene, hand: HandModel, to: Vector3<f64>) -> Result<Vec<Bound>, LabError> {
     scene.largest_speed(0.5)?;
     if hand == HandModel::NONE {
         let at = scene.cycle.device().position();
@@ -192,17 +218,52 @@ fn drag(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result
     } else {
         let arm = scene.cycle.device().handle();
         for k in 1..=500 {
-            let s = crate::smooth(f64::from(k) / 500.0);
-            arm.set_target([0.02 * s, 0.02 * s, -0.01 * s]);
+            arm.set_target((crate::smooth(f64::from(k) / 500.0) * to).into());
             scene.tick()?;
         }
     }
-    scene.largest_speed(1.0)?;
-    scene.largest_speed(2.0)?;
+    scene.largest_speed(3.0)?;
     let late = scene.largest_speed(0.5)?;
-    Ok(CaseOutcome::of(vec![
+    Ok(vec![
         // Below half a centimeter a second nobody feels the motion.
         Bound::new("speed of the tool 3.5 s after the pull / m/s", late, 5e-3),
         Bound::new("energy given beyond what was put in / J", scene.given, TANK),
-    ]))
+    ])
+}
+
+/// Drags the tool of a virtual Touch 3 cm to the side.
+fn drag(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result<CaseOutcome, LabError> {
+    let mut scene = DeviceScene::new(VirtualConfig::touch(), young, hand, simulation, round_trip)?;
+    Ok(CaseOutcome::of(led(&mut scene, hand, Vector3::new(0.02, 0.02, -0.01))?))
+}
+
+/// Pulls a device without friction 2 mm to the side, so that the loop alone calms it. What the
+/// spring of the arm feels along the pull is then the force of the coupling in series with the full
+/// finite elements.
+fn hold(young: f64, hand: HandModel, round_trip: f64) -> Result<CaseOutcome, LabError> {
+    let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
+    let mut scene = DeviceScene::new(device, young, hand, STEPS, round_trip)?;
+    let to = Vector3::new(0.0, 2e-3, 0.0);
+    let mut bounds = led(&mut scene, hand, to)?;
+    if hand == HandModel::NONE {
+        return Ok(CaseOutcome::of(bounds));
+    }
+    let ticks = 500;
+    let (mut felt, mut away) = (0.0, Vector3::zeros());
+    for _ in 0..ticks {
+        scene.tick()?;
+        let device = Vector3::from(scene.cycle.device().position());
+        felt += hand.stiffness * (to - device).y / f64::from(ticks);
+        away += (Vector3::from(scene.cycle.core().last().tool) - scene.origin) / f64::from(ticks);
+    }
+    let (bar, model) = (dragged(young), scene.body.model());
+    let solid = Solid::new(&bar.mesh()?, bar.element, lame(young, bar.poisson), 1e-9);
+    let compliance = solid.compliance(model.surface(), &bar.tip(model)?);
+    let series = compliance + Matrix3::identity() / scene.cycle.core().coupling().stiffness;
+    let want = series.try_inverse().map_or(f64::NAN, |stiffness| (stiffness * away).y);
+    // Over a network, some grips keep coming and going within a step or two of the encoder, and
+    // what is averaged depends on when.
+    let most = if round_trip > 0.0 { 0.05 } else { 0.01 };
+    bounds.push(Bound::new("|force at rest / that of coupling and solid - 1|", felt / want - 1.0, most));
+    Ok(CaseOutcome::of(bounds))
 }

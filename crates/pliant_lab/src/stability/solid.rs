@@ -83,6 +83,13 @@ impl Solid {
     /// The force on a hand that holds a patch of the solid's surface `by` (m) from its rest, N. It
     /// is not a number if a vertex of the patch is no node.
     pub(super) fn reaction(&self, surface: &SurfaceMesh, patch: &Patch, by: [f64; 3]) -> Vector3<f64> {
+        let stiffness = self.compliance(surface, patch).try_inverse();
+        stiffness.map_or_else(|| Vector3::repeat(f64::NAN), |inverse| -(inverse * Vector3::from(by)))
+    }
+
+    /// The way of a patch of the solid's surface under a force on it, m/N. It is not a number if a
+    /// vertex of the patch is no node.
+    pub(super) fn compliance(&self, surface: &SurfaceMesh, patch: &Patch) -> Matrix3<f64> {
         let mut shares = vec![0.0; self.stiffness.size / 3];
         for &(vertex, weight) in patch.entries() {
             let at = Vector3::from(surface.positions()[vertex as usize].map(f64::from));
@@ -90,7 +97,7 @@ impl Solid {
             let node = (0..self.nodes.len()).min_by(|&a, &b| off(a).total_cmp(&off(b)));
             // The surface has its places in single precision.
             let Some(node) = node.filter(|&n| off(n) <= 1e-6 * at.norm()) else {
-                return Vector3::repeat(f64::NAN);
+                return Matrix3::repeat(f64::NAN);
             };
             if let Some(row) = self.rows[node] {
                 shares[row / 3] += weight;
@@ -106,8 +113,6 @@ impl Solid {
             }
         }
         compliance
-            .try_inverse()
-            .map_or_else(|| Vector3::repeat(f64::NAN), |inverse| -(inverse * Vector3::from(by)))
     }
 }
 
