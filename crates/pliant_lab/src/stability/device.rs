@@ -1,5 +1,5 @@
-//! The haptic loop on a virtual device in virtual time: known limits, a body dragged by stiff, loose
-//! and absent hands, and one that is held without any friction in the device.
+//! The haptic loop on a virtual device in virtual time: known limits, a body dragged by stiff,
+//! loose and absent hands, and one that a device without friction holds.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -208,8 +208,8 @@ impl DeviceScene {
     }
 }
 
-/// Leads the arm `to` (m) within half a second and lets the device come to rest. Without a hand, the
-/// free device gets an initial velocity instead. Returns the bounds on what it does.
+/// Leads the arm `to` (m) within half a second and lets the device come to rest. Without a hand,
+/// the free device gets an initial velocity instead. Returns the bounds on what it does.
 fn led(scene: &mut DeviceScene, hand: HandModel, to: Vector3<f64>) -> Result<Vec<Bound>, LabError> {
     scene.largest_speed(0.5)?;
     if hand == HandModel::NONE {

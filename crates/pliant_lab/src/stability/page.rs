@@ -16,7 +16,7 @@ these (one number where both have the same). Stiffness, density, size and step a
 through phases, damping ratios and relaxation alone, so that two cases of one script that have these
 alike are one case for the arithmetic, in other units. The column of dynamics counts those that
 differ. Numbers far below 1e-9 are rounding, and differ from processor to processor. A tool at 0 m/s
-is held by the friction of its device, 0.26 N as in a Touch.
+is held by the friction of its device, 0.26 N as in a Touch, but where a case has none.
 
 ";
 
