@@ -1,5 +1,5 @@
-//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes, capsules and meshes of
-//! a scene, and each other.
+//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes, capsules, meshes
+//! and distance fields of a scene, and each other.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -44,6 +44,7 @@
 #[cfg(feature = "avian")]
 mod avian;
 mod contacts;
+mod distance_field;
 #[cfg(feature = "mesh")]
 mod mesh;
 mod obstacle;
@@ -57,6 +58,7 @@ use bevy::{
 use pliant_body::PliantSystems;
 
 pub use contacts::{BodyContacts, BodyFriction, ContactEnded, ContactPoint, ContactStarted, TouchBodies};
+pub use distance_field::DistanceField;
 pub use obstacle::{ContactLayers, Obstacle};
 
 /// Lets bodies touch the [`Obstacle`]s of the scene, and each other ([`TouchBodies`]).
@@ -86,7 +88,8 @@ impl Plugin for ContactPlugin {
         app.init_resource::<mesh::Solids>();
         #[cfg(feature = "avian")]
         avian::build(app, self.schedule);
-        app.register_type::<Obstacle>()
+        app.init_asset::<DistanceField>()
+            .register_type::<Obstacle>()
             .register_type::<ContactLayers>()
             .register_type::<BodyFriction>()
             .register_type::<TouchBodies>()

@@ -29,9 +29,8 @@ pub(crate) struct Solid {
     tiny: f64,
 }
 
-impl Solid {
-    /// Distance (m) and normal at a point in the obstacle's axes.
-    pub(crate) fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
+impl modal::ObstacleShape for Solid {
+    fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
         let p = Vector::new(point.x, point.y, point.z);
         let found = self.triangles.project_local_point_and_get_location_with_max_dist(p, false, f64::MAX);
         let Some((closest, (triangle, _))) = found.filter(|_| p.is_finite()) else {
@@ -48,7 +47,9 @@ impl Solid {
         };
         modal::SurfacePoint { distance: sign * length, normal: Vector3::new(normal.x, normal.y, normal.z) }
     }
+}
 
+impl Solid {
     /// Makes the solid of a mesh with the scale of its entity.
     pub(crate) fn new(source: &Source, scale: DVec3) -> Result<Self, StepError> {
         let points: Vec<DVec3> = source.positions.iter().map(|p| Vec3::from(*p).as_dvec3() * scale).collect();
@@ -160,21 +161,6 @@ fn size(points: &[Vector]) -> f64 {
     (high - low).length()
 }
 
-/// A solid in the world of a body on an entity of uniform scale: lengths there are those of the
-/// app's world divided by `factor`.
-#[derive(Debug)]
-pub(crate) struct InWorldOf {
-    pub(crate) solid: Arc<Solid>,
-    pub(crate) factor: f64,
-}
-
-impl modal::ObstacleShape for InWorldOf {
-    fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
-        let found = self.solid.at(&(point * self.factor));
-        modal::SurfacePoint { distance: found.distance / self.factor, ..found }
-    }
-}
-
 /// What a solid is made of.
 pub(crate) struct Source {
     pub(crate) positions: Vec<[f32; 3]>,
@@ -183,7 +169,7 @@ pub(crate) struct Source {
 }
 
 impl Source {
-    fn new(mesh: &Mesh, hull: bool) -> Result<Self, StepError> {
+    pub(crate) fn new(mesh: &Mesh, hull: bool) -> Result<Self, StepError> {
         let unusable = |expected| StepError::Input { what: "an obstacle's mesh", expected, got: f64::NAN };
         let MeshTriangles { positions, triangles } = MeshTriangles::of(mesh).map_err(unusable)?;
         Ok(Self { positions, triangles, hull })

@@ -1,8 +1,6 @@
 //! Obstacles as components, and their motion from tick to tick.
 
-#[cfg(feature = "mesh")]
-use std::collections::BTreeSet;
-use std::sync::Arc;
+use std::{collections::BTreeSet, sync::Arc};
 
 use bevy::{
     math::{DQuat, DVec3},
@@ -12,13 +10,14 @@ use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused, Pose};
 use pliant_modal as modal;
 
+use crate::DistanceField;
 #[cfg(feature = "mesh")]
-use crate::mesh::{InWorldOf, Solid, Solids};
+use crate::mesh::Solids;
 
 /// A rigid shape that bodies touch, at the entity's `Transform`.
 ///
-/// The scale of the entity multiplies the shape. A ball and a capsule take the largest of the three
-/// scales. A scale that is not finite takes the obstacle out of the scene until it is.
+/// The scale of the entity multiplies the shape. A ball, a capsule and a field take the largest of
+/// the three scales. A scale that is not finite takes the obstacle out of the scene until it is.
 ///
 /// An obstacle may move. Its velocity is its way since the last tick, so that it carries and pushes
 /// what it touches. Bodies do not push it back. A way faster than 100 m/s or 100 rad/s is a
@@ -56,6 +55,8 @@ pub enum Obstacle {
     /// nothing until the mesh is loaded, and a mesh that is only in the render world is refused.
     #[cfg(feature = "mesh")]
     Mesh(Handle<Mesh>),
+    /// A signed distance field. It touches nothing until the asset is there.
+    Field(Handle<DistanceField>),
 }
 
 /// Selects what touches what: a body and an obstacle touch if each one's filters have a bit of the
@@ -83,33 +84,26 @@ impl ContactLayers {
     }
 }
 
-/// The shape of an obstacle, as far as its component describes it, or its triangles.
+/// The shape of an obstacle.
 #[derive(Debug, Clone)]
 enum Shape {
+    /// As its component describes it.
     Plain(Obstacle),
-    #[cfg(feature = "mesh")]
-    Solid(Arc<Solid>),
-    /// The shape of another engine's collider, m.
-    #[cfg(feature = "avian")]
-    Collider(Arc<dyn modal::ObstacleShape>),
-}
-
-#[cfg(feature = "mesh")]
-impl Shape {
-    fn is_solid(&self) -> bool {
-        matches!(self, Self::Solid(_))
-    }
+    /// Made from an asset, or from another engine's collider.
+    Made {
+        shape: Arc<dyn modal::ObstacleShape>,
+        /// Length in the app's world of the shape's unit, m.
+        unit: f64,
+    },
 }
 
 impl PartialEq for Shape {
     fn eq(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Plain(a), Self::Plain(b)) => a == b,
-            #[cfg(feature = "mesh")]
-            (Self::Solid(a), Self::Solid(b)) => Arc::ptr_eq(a, b),
-            #[cfg(feature = "avian")]
-            (Self::Collider(a), Self::Collider(b)) => Arc::ptr_eq(a, b),
-            #[cfg(feature = "mesh")]
+            (Self::Made { shape: a, unit: x }, Self::Made { shape: b, unit: y }) => {
+                Arc::ptr_eq(a, b) && x == y
+            }
             _ => false,
         }
     }
@@ -135,13 +129,13 @@ pub(crate) struct Motion {
 }
 
 impl Motion {
-    /// `solid` gives the shape of a mesh at a scale, when it is known. `last` is the motion until
+    /// `made` gives the shape of an asset at a scale, when it is known. `last` is the motion until
     /// now.
     fn new(
         shape: &Obstacle,
         global: &GlobalTransform,
         last: Option<&Self>,
-        solid: impl FnOnce(DVec3) -> Option<Shape>,
+        made: impl FnOnce(DVec3) -> Option<Shape>,
     ) -> Option<Self> {
         let (scale, rotation, position) = global.to_scale_rotation_translation();
         let sound = scale.is_finite() && rotation.is_finite() && position.is_finite();
@@ -152,11 +146,9 @@ impl Motion {
         let shape = match shape {
             _ if !sound => return None,
             #[cfg(feature = "mesh")]
-            Obstacle::Hull(_) | Obstacle::Mesh(_) => solid(scale)?,
-            plain => {
-                let _ = solid;
-                Shape::Plain(plain.clone())
-            }
+            Obstacle::Hull(_) | Obstacle::Mesh(_) => made(scale)?,
+            Obstacle::Field(_) => made(scale)?,
+            plain => Shape::Plain(plain.clone()),
         };
         Some(Self {
             shape,
@@ -183,7 +175,7 @@ impl Motion {
         last: Option<&Self>,
     ) -> Self {
         let (position, rotation) = (pose.origin, pose.orientation);
-        let (shape, scale) = (Shape::Collider(shape), DVec3::ONE);
+        let (shape, scale) = (Shape::Made { shape, unit: 1.0 }, DVec3::ONE);
         let now =
             Self { shape, scale, position, rotation, velocity, spin, rigid, changed: true, sound: true };
         // What moves is passed on anew at each step, so that the bodies near it stay awake with it.
@@ -221,32 +213,22 @@ impl Motion {
     fn visit<V: Visit>(&self, scale: f64, visit: V) -> V::Output {
         let whole = self.scale.abs().max_element() / scale;
         let center = [0.0; 3];
-        #[cfg_attr(
-            not(feature = "mesh"),
-            expect(clippy::infallible_destructuring_match, reason = "there are solids, too")
-        )]
         let plain = match &self.shape {
             Shape::Plain(plain) => plain,
-            #[cfg(feature = "mesh")]
-            Shape::Solid(solid) => {
-                return visit.visit(self.moving(InWorldOf { solid: solid.clone(), factor: scale }, scale));
-            }
-            #[cfg(feature = "avian")]
-            Shape::Collider(shape) => {
-                let shape = crate::avian::InWorldOf { shape: shape.clone(), factor: scale };
-                return match self.rigid {
-                    None => visit.visit(self.moving(shape, scale)),
-                    Some(rigid) => visit.visit(crate::avian::Owned {
-                        shape: self.moving(shape, scale),
-                        key: crate::avian::key(rigid, scale),
-                    }),
-                };
+            Shape::Made { shape, unit } => {
+                let shape = self.moving(InWorldOf { shape: shape.clone(), factor: scale / unit }, scale);
+                #[cfg(feature = "avian")]
+                if let Some(rigid) = self.rigid {
+                    return visit.visit(crate::avian::Owned { shape, key: crate::avian::key(rigid, scale) });
+                }
+                return visit.visit(shape);
             }
         };
         match *plain {
-            // These have a solid instead.
+            // These are made.
             #[cfg(feature = "mesh")]
             Obstacle::Hull(_) | Obstacle::Mesh(_) => visit.visit(Nothing),
+            Obstacle::Field(_) => visit.visit(Nothing),
             Obstacle::Floor => visit.visit(self.moving(modal::Plane::GROUND, scale)),
             Obstacle::Ball { radius } => {
                 let radius = f64::from(radius) * whole;
@@ -324,17 +306,53 @@ impl modal::ObstacleShape for Nothing {
     }
 }
 
-/// Finds the triangles of obstacles that have some.
-#[cfg(feature = "mesh")]
-#[derive(bevy::ecs::system::SystemParam)]
-pub(crate) struct Meshes<'w, 's> {
-    solids: ResMut<'w, Solids>,
-    meshes: Option<Res<'w, Assets<Mesh>>>,
-    changes: Option<MessageReader<'w, 's, AssetEvent<Mesh>>>,
+/// A shape in the world of a body: lengths there are those of the shape's axes divided by `factor`.
+#[derive(Debug)]
+pub(crate) struct InWorldOf {
+    pub(crate) shape: Arc<dyn modal::ObstacleShape>,
+    pub(crate) factor: f64,
 }
 
-#[cfg(feature = "mesh")]
-impl Meshes<'_, '_> {
+impl modal::ObstacleShape for InWorldOf {
+    fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
+        let found = self.shape.at(&(point * self.factor));
+        modal::SurfacePoint { distance: found.distance / self.factor, ..found }
+    }
+
+    fn curvature(&self) -> f64 {
+        self.factor * self.shape.curvature()
+    }
+
+    fn check(&self) -> Result<(), modal::StepError> {
+        let sound = self.factor > 0.0 && self.factor.is_finite();
+        let (what, expected) = ("scale of an obstacle", "three numbers of which one is not 0");
+        if !sound {
+            return Err(modal::StepError::Input { what, expected, got: 1.0 / self.factor });
+        }
+        self.shape.check()
+    }
+
+    fn fixed(&self) -> Option<modal::FixedObstacle> {
+        self.shape.fixed().filter(|_| self.factor == 1.0)
+    }
+}
+
+/// Finds the shapes of obstacles that are made from assets.
+#[derive(bevy::ecs::system::SystemParam)]
+pub(crate) struct Made<'w, 's> {
+    fields: Res<'w, Assets<DistanceField>>,
+    #[cfg(feature = "mesh")]
+    solids: ResMut<'w, Solids>,
+    #[cfg(feature = "mesh")]
+    meshes: Option<Res<'w, Assets<Mesh>>>,
+    #[cfg(feature = "mesh")]
+    changes: Option<MessageReader<'w, 's, AssetEvent<Mesh>>>,
+    /// The obstacles whose assets were refused.
+    refused: Local<'s, BTreeSet<Entity>>,
+}
+
+impl Made<'_, '_> {
+    #[cfg(feature = "mesh")]
     fn tidy(&mut self) {
         let changed = self.changes.iter_mut().flat_map(MessageReader::read).filter_map(|event| match event {
             AssetEvent::Modified { id } | AssetEvent::Removed { id } => Some(*id),
@@ -345,21 +363,29 @@ impl Meshes<'_, '_> {
 
     /// Returns the shape of an obstacle at a scale, and the error of a mesh that cannot be one.
     fn find(&mut self, obstacle: &Obstacle, scale: DVec3) -> Option<Result<Shape, modal::StepError>> {
-        let (mesh, hull) = match obstacle {
-            Obstacle::Hull(mesh) => (mesh, true),
-            Obstacle::Mesh(mesh) => (mesh, false),
-            _ => return None,
+        #[cfg(feature = "mesh")]
+        let mut solid = |mesh, hull| {
+            let found = self.solids.get(self.meshes.as_deref()?, mesh, hull, scale)?;
+            Some(found.map(|shape| Shape::Made { shape, unit: 1.0 }))
         };
-        let found = self.solids.get(self.meshes.as_deref()?, mesh, hull, scale)?;
-        Some(found.map(Shape::Solid))
+        match obstacle {
+            #[cfg(feature = "mesh")]
+            Obstacle::Hull(mesh) => solid(mesh, true),
+            #[cfg(feature = "mesh")]
+            Obstacle::Mesh(mesh) => solid(mesh, false),
+            Obstacle::Field(field) => {
+                let shape = self.fields.get(field)?.shape();
+                Some(Ok(Shape::Made { shape, unit: scale.abs().max_element() }))
+            }
+            _ => None,
+        }
     }
 }
 
 /// Takes the pose of every obstacle at this tick, and its motion since the last one.
 pub(crate) fn move_obstacles(
     time: Res<Time>,
-    #[cfg(feature = "mesh")] mut meshes: Meshes,
-    #[cfg(feature = "mesh")] mut unsound: Local<BTreeSet<Entity>>,
+    mut made: Made,
     mut commands: Commands,
     transforms: TransformHelper,
     mut obstacles: Query<(Entity, &Obstacle, Option<&mut Motion>)>,
@@ -371,32 +397,30 @@ pub(crate) fn move_obstacles(
     }
     let step = time.delta_secs_f64();
     #[cfg(feature = "mesh")]
-    {
-        meshes.tidy();
-        unsound.retain(|entity| obstacles.contains(*entity));
-    }
+    made.tidy();
+    made.refused.retain(|entity| obstacles.contains(*entity));
     for (entity, shape, motion) in &mut obstacles {
         // `GlobalTransform` is that of the last frame.
         let global = transforms.compute_global_transform(entity).ok();
-        #[cfg(feature = "mesh")]
-        let solid = |scale| match meshes.find(shape, scale) {
+        let found = |scale| match made.find(shape, scale) {
             // What was there stays until the new one is made.
-            None => motion.as_ref().map(|last| last.shape.clone()).filter(Shape::is_solid),
-            Some(Ok(solid)) => {
-                unsound.remove(&entity);
-                Some(solid)
+            None => {
+                let last = motion.as_ref().map(|last| last.shape.clone());
+                last.filter(|last| matches!(last, Shape::Made { .. }))
+            }
+            Some(Ok(found)) => {
+                made.refused.remove(&entity);
+                Some(found)
             }
             Some(Err(error)) => {
-                if unsound.insert(entity) {
+                if made.refused.insert(entity) {
                     warn!("{entity}: {error}");
                     commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
                 }
                 None
             }
         };
-        #[cfg(not(feature = "mesh"))]
-        let solid = |_| None;
-        let mut now = global.and_then(|global| Motion::new(shape, &global, motion.as_deref(), solid));
+        let mut now = global.and_then(|global| Motion::new(shape, &global, motion.as_deref(), found));
         if let (Some(now), Some(last)) = (&mut now, &motion) {
             *now = now.clone().after(last, step);
         }

@@ -60,32 +60,6 @@ pub(crate) fn key(rigid: Entity, scale: f64) -> [u64; 2] {
     [rigid.to_bits(), scale.to_bits()]
 }
 
-/// A collider in the world of a body on an entity of uniform scale `factor`.
-#[derive(Debug)]
-pub(crate) struct InWorldOf {
-    pub(crate) shape: Arc<dyn ObstacleShape>,
-    pub(crate) factor: f64,
-}
-
-impl ObstacleShape for InWorldOf {
-    fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
-        let found = self.shape.at(&(point * self.factor));
-        SurfacePoint { distance: found.distance / self.factor, ..found }
-    }
-
-    fn curvature(&self) -> f64 {
-        self.factor * self.shape.curvature()
-    }
-
-    fn check(&self) -> Result<(), StepError> {
-        self.shape.check()
-    }
-
-    fn fixed(&self) -> Option<modal::FixedObstacle> {
-        self.shape.fixed().filter(|_| self.factor == 1.0)
-    }
-}
-
 /// An obstacle that gives way with a rigid body.
 #[derive(Debug)]
 pub(crate) struct Owned<O> {

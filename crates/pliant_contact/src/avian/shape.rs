@@ -13,7 +13,7 @@ use nalgebra::Vector3;
 use pliant_modal::{self as modal, ObstacleShape, StepError, SurfacePoint};
 
 use crate::{
-    mesh::{InWorldOf, Solid, Source},
+    mesh::{Solid, Source},
     obstacle::FAR,
 };
 
@@ -88,7 +88,7 @@ fn wide(v: Vector) -> [f64; 3] {
 fn solid(points: &[Vector], triangles: Vec<[u32; 3]>, hull: bool) -> Made {
     let positions = points.iter().map(|p| p.to_array()).collect();
     let solid = Solid::new(&Source { positions, triangles, hull }, DVec3::ONE)?;
-    Ok(Arc::new(InWorldOf { solid: Arc::new(solid), factor: 1.0 }))
+    Ok(Arc::new(solid))
 }
 
 fn hull(of: &ConvexPolyhedron) -> Made {

@@ -8,7 +8,7 @@ use bevy::{
 use pliant_modal::{Cuboid, ObstacleShape};
 
 use super::*;
-use crate::mesh::{InWorldOf, Solids};
+use crate::{DistanceField, mesh::Solids, obstacle::InWorldOf};
 
 /// A mesh of boxes (center, half edges), each with vertices of its own for each face.
 fn boxes(all: &[([f32; 3], [f32; 3])]) -> Mesh {
@@ -46,7 +46,7 @@ fn solid(mesh: Mesh, hull: bool, scale: DVec3) -> Result<InWorldOf, pliant_modal
             None => std::thread::yield_now(),
         }
     };
-    Ok(InWorldOf { solid: made, factor: 1.0 })
+    Ok(InWorldOf { shape: made, factor: 1.0 })
 }
 
 fn points() -> impl Iterator<Item = nalgebra::Vector3<f64>> {
@@ -90,8 +90,8 @@ fn a_box_of_triangles_is_a_box_whichever_way_it_was_made() {
         same(&found, |p| scaled.at(p).distance);
         // In the world of a body on an entity of twice the scale, all lengths are half as long.
         let half = Cuboid { center: [0.05, 0.1, -0.15], half: [0.25, 0.125, 0.375], ..exact };
-        let InWorldOf { solid, .. } = solid(mesh(), hull, DVec3::ONE).unwrap();
-        same(&InWorldOf { solid, factor: 2.0 }, |p| half.at(p).distance);
+        let InWorldOf { shape, .. } = solid(mesh(), hull, DVec3::ONE).unwrap();
+        same(&InWorldOf { shape, factor: 2.0 }, |p| half.at(p).distance);
     }
 }
 
@@ -197,12 +197,17 @@ fn wait(app: &mut App, obstacle: Entity) {
 }
 
 #[test]
-fn a_body_rests_on_triangles_as_on_a_floor() {
-    for hull in [false, true] {
+fn a_body_rests_on_triangles_and_on_their_distance_field_as_on_a_floor() {
+    for kind in 0..3 {
         let mut app = mesh_app();
         let table = boxes(&[([0.0, -0.25, 0.0], [1.0, 0.25, 1.0])]);
-        let table = app.world_mut().resource_mut::<Assets<Mesh>>().add(table);
-        let shape = if hull { Obstacle::Hull(table) } else { Obstacle::Mesh(table) };
+        let shape = if kind == 2 {
+            let field = DistanceField::of_mesh(&table, 0.07).unwrap();
+            Obstacle::Field(app.world_mut().resource_mut::<Assets<DistanceField>>().add(field))
+        } else {
+            let table = app.world_mut().resource_mut::<Assets<Mesh>>().add(table);
+            if kind == 1 { Obstacle::Hull(table) } else { Obstacle::Mesh(table) }
+        };
         // The entity's scale of 2 is the mesh's: the top is at y = 0.3.
         let at = Transform::from_xyz(0.0, 0.3, 0.0).with_scale(Vec3::splat(2.0));
         let table = app.world_mut().spawn((shape, at)).id();
@@ -279,4 +284,26 @@ fn a_mesh_that_changes_is_made_anew_and_a_bad_one_is_told_once() {
     }
     let received = &app.world().resource::<Received>().refused;
     assert_eq!(received.len(), 1, "{received:?}");
+}
+
+#[test]
+fn a_field_is_the_solid_that_it_was_made_of() {
+    let torus = Torus { major_radius: 0.8, minor_radius: 0.3 };
+    let mesh = torus.mesh().major_resolution(96).minor_resolution(48).build();
+    let exact = solid(mesh.clone(), false, DVec3::ONE).unwrap();
+    let cell = 0.05;
+    let field = DistanceField::of_mesh(&mesh, cell).unwrap();
+    for point in points() {
+        let (found, exact) = (field.field().at(&point), exact.at(&point));
+        let [off, cell] = [found.distance - exact.distance, f64::from(cell)];
+        // Near the surface, which has facets; beyond the grid it is a lower bound.
+        assert!(off < 0.3 * cell, "{point}: {} for {}", found.distance, exact.distance);
+        if exact.distance.abs() < 2.0 * cell {
+            assert!(off.abs() < 0.03 * cell, "{point}: {} for {}", found.distance, exact.distance);
+        }
+    }
+    let open = triangles(vec![[0.0; 3], [1.0, 0.0, f32::NAN], [0.0, 0.0, 1.0]], vec![0, 2, 1]);
+    assert!(DistanceField::of_mesh(&open, cell).is_err());
+    assert!(DistanceField::of_mesh(&mesh, 0.0).is_err());
+    assert!(DistanceField::of_mesh(&mesh, f32::NAN).is_err());
 }

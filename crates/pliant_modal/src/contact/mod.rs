@@ -26,6 +26,7 @@
 
 mod cone;
 mod contacts;
+mod distance_field;
 mod fixed;
 mod indent;
 mod obstacle;
@@ -39,6 +40,7 @@ mod surface_field;
 
 pub use cone::contact_force;
 pub use contacts::{Contact, ContactMemory, ContactReport, ContactState, Contacts, Touched};
+pub use distance_field::DistanceField;
 pub use fixed::{FixedObstacle, FixedShape};
 pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint};
 pub use probe::{Probe, ProbeConfig, ProbeContact};

@@ -63,7 +63,7 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
 }
 
 /// Returns the vector's length and its direction. A vector without direction returns `otherwise`.
-fn direction(v: Vector3<f64>, otherwise: Vector3<f64>) -> (f64, Vector3<f64>) {
+pub(super) fn direction(v: Vector3<f64>, otherwise: Vector3<f64>) -> (f64, Vector3<f64>) {
     let length = v.norm();
     if length > f64::MIN_POSITIVE { (length, v / length) } else { (0.0, otherwise) }
 }
