@@ -20,7 +20,7 @@ SCENES = {
     "solo": ("one body, pulled and looked at", ["window"]),
     "many": ("a thousand bodies of one model", ["window"]),
     "crowd": ("a thousand bodies of one model, no picture", []),
-    "held": ("a thousand bodies of 60 modes, a hand at each, no picture", []),
+    "held": ("a thousand bodies of 30 modes, a hand at each, no picture", []),
     "host": ("a server of one body, no picture, one guest", ["net"]),
     "guest": ("a guest that sees and holds the host's body", ["window", "net"]),
     "haptics": ("one body that is felt, a device at 1 kHz", ["window", "haptics"]),

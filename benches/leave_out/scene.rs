@@ -28,7 +28,7 @@ pub enum Scene {
     Many,
     /// A thousand bodies of one model, without rendering (no feature).
     Crowd,
-    /// A thousand bodies of 60 modes, each held by a hand, without rendering (no feature).
+    /// A thousand bodies of 30 modes, each held by a hand, without rendering (no feature).
     Held,
     /// A server of one body with one guest, without rendering (`net`).
     Host,
@@ -178,8 +178,7 @@ pub fn spawn(scene: Scene, app: &mut App, company: &mut Company) -> Result<(), B
         Scene::Held => {
             let handle = add(pip.clone());
             for i in 0..1_000 {
-                let body = ModalBody { modes: Some(60), ..ModalBody::new(handle.clone()) };
-                app.world_mut().spawn((body, in_rows(i)));
+                app.world_mut().spawn((ModalBody::new(handle.clone()), in_rows(i)));
             }
             app.insert_resource(Hand { vertex: side, from: place.as_dvec3(), grab: None });
             app.add_systems(FixedUpdate, pull_all.before(PliantSystems::Input));

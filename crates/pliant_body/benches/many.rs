@@ -1,14 +1,15 @@
-//! What a thousand linear bodies of 20 modes take from a frame without a picture, through the
-//! systems of the plugin: resting, in motion, and in motion with a hand each. The frame of an app
-//! without bodies is subtracted.
+//! What a thousand linear bodies take from a frame without a picture, through the systems of the
+//! plugin: of 20 modes resting, in motion, and in motion with a hand each, and of 60 modes with a
+//! hand each. The frame of an app without bodies is subtracted.
 //!
-//! `cargo bench -p pliant_body --bench many`. With the name of a case, only that one runs,
+//! `cargo bench -p pliant_body --features bake,bevy/multi_threaded --bench many`. With the name of a case, only that one runs,
 //! which is what a profiler wants.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a bench may stop")]
 
 use std::{sync::Arc, time::Instant};
 
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
+use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
 use pliant_body::{
     BodyState, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems, RidingPlugin,
 };
@@ -18,22 +19,38 @@ use pliant_modal::{Elasticity, ModalModel};
 const STEP: f64 = 1.0 / 60.0;
 const FRAMES: usize = 300;
 
-/// Modes of a body, all of the model's.
-const MODES: usize = 20;
-
 struct Case {
     name: &'static str,
     bodies: usize,
     awake: bool,
     held: bool,
+    /// Modes of a body, all of its model's.
+    modes: usize,
 }
 
-const CASES: [Case; 4] = [
-    Case { name: "none", bodies: 0, awake: false, held: false },
-    Case { name: "resting", bodies: 1000, awake: false, held: false },
-    Case { name: "awake", bodies: 1000, awake: true, held: false },
-    Case { name: "held", bodies: 1000, awake: true, held: true },
+const CASES: [Case; 6] = [
+    Case { name: "none", bodies: 0, awake: false, held: false, modes: 20 },
+    Case { name: "resting", bodies: 1000, awake: false, held: false, modes: 20 },
+    Case { name: "awake", bodies: 1000, awake: true, held: false, modes: 20 },
+    Case { name: "held", bodies: 1000, awake: true, held: true, modes: 20 },
+    Case { name: "awake, 60 modes", bodies: 1000, awake: true, held: false, modes: 60 },
+    Case { name: "held, 60 modes", bodies: 1000, awake: true, held: true, modes: 60 },
 ];
+
+/// A shipped body of 20 modes, or a bar of 60.
+fn model(modes: usize) -> ModalModel {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bud.modal");
+    let model = if modes == 20 {
+        ModalModel::read(path).unwrap()
+    } else {
+        let mesh = pliant_mesh::shapes::bar([8, 2, 2], [0.2, 0.05, 0.05]).unwrap();
+        let anchor = Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 };
+        let config = BakeConfig { modes, anchors: vec![anchor], ..BakeConfig::linear() };
+        bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model
+    };
+    assert_eq!(model.mode_count(), modes);
+    model
+}
 
 /// Moves the hands in circles of a centimeter.
 fn lead(time: Res<Time>, mut grabs: Query<(&mut Grab, &Start)>) {
@@ -53,9 +70,7 @@ fn app(case: &Case) -> App {
         .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
         .add_plugins((PliantBodyPlugin::default(), RidingPlugin::default()))
         .add_systems(FixedUpdate, lead.before(PliantSystems::Input));
-    let assets = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
-    let model = Arc::new(ModalModel::read(format!("{assets}/bud.modal")).unwrap());
-    assert_eq!(model.mode_count(), MODES);
+    let model = Arc::new(model(case.modes));
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(model.clone()));
     for index in 0..case.bodies {
         let mut body = ModalBody::new(handle.clone());

@@ -4,7 +4,10 @@ use std::sync::{Arc, Weak};
 
 use bevy::{
     diagnostic::Diagnostics,
-    ecs::{name::NameOrEntityItem, system::SystemParam},
+    ecs::{
+        name::NameOrEntityItem,
+        system::{NonSendMarker, SystemParam},
+    },
     math::{DQuat, DVec3},
     platform::time::Instant,
     prelude::*,
@@ -337,6 +340,9 @@ fn take_hold(body: &mut Body, grab: &Grab) -> Result<pliant_modal::GrabId, BodyE
 }
 
 pub(crate) fn step_bodies(
+    // Bevy runs other systems on a thread of the pool, which then hands work to all threads but the
+    // main one: on two cores, to itself alone.
+    _main: NonSendMarker,
     time: Res<Time>,
     mut diagnostics: Diagnostics,
     mut refusals: Refusals,

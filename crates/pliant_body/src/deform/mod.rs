@@ -21,6 +21,7 @@ use bevy::{
         visibility::{NoAutoAabb, VisibilitySystems},
     },
     diagnostic::Diagnostics,
+    ecs::system::NonSendMarker,
     mesh::{Indices, PrimitiveTopology},
     platform::time::Instant,
     prelude::*,
@@ -247,6 +248,8 @@ struct Written<'a> {
 const WORTH: usize = 2_000;
 
 fn deform_surfaces(
+    // As for steps: the main thread works too.
+    _main: NonSendMarker,
     mut commands: Commands,
     wanted: Res<SurfaceDeformation>,
     compute: Option<Res<Compute>>,

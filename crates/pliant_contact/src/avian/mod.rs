@@ -30,7 +30,7 @@ use bevy::{
 };
 use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused, BodyState, ModalBody, PliantSystems, Pose, RigidBodies};
-use pliant_modal::{self as modal, ObstacleShape, Rigid, StepError, Support, SurfacePoint};
+use pliant_modal::{ObstacleShape, Rigid, StepError, Support, SurfacePoint};
 
 use crate::{
     contacts::{BodyContacts, Nearby, place_obstacles, publish, touch_bodies},
