@@ -272,7 +272,7 @@ fn measure(
             (Vec::new(), tables::table_2(models, own, size, progress)?)
         }
         Part::Table2Repair => {
-            let size = if quick { (1.0, 40) } else { (10.0, 4) };
+            let size = if quick { (2.0, 40) } else { (10.0, 4) };
             (Vec::new(), tables::table_2_repair(models, own, size, progress)?)
         }
         Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
