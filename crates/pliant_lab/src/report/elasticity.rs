@@ -23,8 +23,8 @@ struct Setting {
     line: usize,
     /// Errors of the force, as a share of it, and of the surface, m, at each displacement.
     errors: Vec<[f64; 2]>,
-    /// Time for a second at rest after the pull, all steps and surfaces: median and 99th percentile,
-    /// us.
+    /// Time for a second at rest after the pull, all steps and surfaces: median and 99th
+    /// percentile, us.
     cost: [f64; 2],
     /// Size of the model's file, bytes.
     bytes: usize,

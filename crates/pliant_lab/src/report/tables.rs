@@ -244,9 +244,9 @@ pub(super) fn table_2_repair(
     Ok(out)
 }
 
-/// Compares bodies at run time with the full nonlinear solution, for the bunny pulled by its ear, or
-/// for the project's own body if the bunny does not exist: linear elasticity, and what a bake has by
-/// default, reduced elasticity.
+/// Compares bodies at run time with the full nonlinear solution, for the bunny pulled by its ear,
+/// or for the project's own body if the bunny does not exist: linear elasticity, and what a bake
+/// has by default, reduced elasticity.
 ///
 /// The linear body has four-node tetrahedra at the paper's size, then ten-node tetrahedra (the
 /// default of the bake) in a smaller number, because a nonlinear solution with as many of those
@@ -315,7 +315,7 @@ impl PulledBody {
         Ok(Self { name, mesh, setting, model, patch, direction, give })
     }
 
-    /// The load that pulls the patch by a share of the body's size, if the linear theory were right.
+    /// The load that pulls the patch by a share of the body's size, were the linear theory right.
     fn load(&self, share: f64) -> Vec<DeadLoad> {
         let force = share * self.model.size() / self.give;
         vec![DeadLoad { patch: self.patch.clone(), force: self.direction.map(|x| force * x) }]

@@ -126,8 +126,8 @@ fn falls(elasticity: Elasticity, young: f64, rate: f64) -> Result<CaseOutcome, L
         &fallen.ticks,
         vec![
             Bound::new("|force at rest / weight - 1|", force / (fallen.mass * GRAVITY) - 1.0, 1e-4),
-            // The block is as broad as high, its face rubs on the ground, and the softest is pressed
-            // by a tenth: a full solution is not quite that of a column.
+            // The block is as broad as high, its face rubs on the ground, and the softest is
+            // pressed by a tenth: a full solution is not quite that of a column.
             Bound::new(SINKS, sunk / column - 1.0, 0.2),
             Bound::new(DEPTH, deepest(last) / fallen.size, 1e-5),
         ],

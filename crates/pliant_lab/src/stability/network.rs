@@ -1,5 +1,5 @@
-//! Sessions over bad networks in virtual time: the default recovery must stay within its bounds. The
-//! results of the paper's recovery and of none stand beside it, with the default's repeats and
+//! Sessions over bad networks in virtual time: the default recovery must stay within its bounds.
+//! The results of the paper's recovery and of none stand beside it, with the default's repeats and
 //! playout delay and the paper's integrator. They have no bound.
 
 use std::time::Duration;
