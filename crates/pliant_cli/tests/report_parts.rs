@@ -18,7 +18,7 @@ impl Part {
         let folder = Folder::new(&format!("part-{name}"));
         let out = folder.file("out");
         // The page has this part already, and another one, which has to stay.
-        let [modes, precision] = ["b. Modes kept", "e. Precision"];
+        let [modes, precision] = ["b. Modes kept", "e1. Precision"];
         let other = if name == "modes" { precision } else { modes };
         std::fs::create_dir_all(folder.0.join("out")).unwrap();
         let page = folder.0.join("out/report.md");
@@ -115,6 +115,41 @@ fn number_after(text: &str, before: &str) -> f64 {
     let (_, after) = text.split_once(before).unwrap_or_else(|| panic!("{before} in {text}"));
     let end = after.find(|c: char| !(c.is_ascii_digit() || "+-.e".contains(c))).unwrap_or(after.len());
     after[..end].trim_end_matches('.').parse().unwrap_or_else(|e| panic!("{before}: {e} in {after}"))
+}
+
+/// A row of a table of pulls. Distances are % of the size, forces % of the load.
+#[derive(Debug)]
+struct Pulled {
+    by: f64,
+    /// Error of the surface: root mean square and largest.
+    rms: f64,
+    most: f64,
+    /// Error of the force: along the pull, and all of it.
+    along: f64,
+    whole: f64,
+    /// The largest error of the surface and the whole one of the force without the warp, or without
+    /// the patch's own shapes.
+    bare_most: f64,
+    bare_whole: f64,
+    step_us: f64,
+}
+
+impl Pulled {
+    fn of(row: &[&str]) -> Self {
+        let number = |cell: usize| number_after(row[cell], "");
+        let [whole, bare_whole] = [3, 4].map(|cell| number_after(row[cell], "("));
+        let most = number_after(row[1], " / ");
+        Self {
+            by: number(0),
+            rms: number(1),
+            most,
+            along: number(3),
+            whole,
+            bare_most: number(2),
+            bare_whole,
+            step_us: number(5),
+        }
+    }
 }
 
 fn last(line: &[(f64, f64)]) -> f64 {
@@ -435,6 +470,10 @@ fn what_compensation_adds_is_measured_on_our_own_body() {
         assert!(without > 0.0 && (0.5..2.0).contains(&(with / without / times)), "{row:?}");
         let (least, most) = (number(5), number_after(row[5], " to "));
         assert!(least <= times && times <= most, "{row:?}");
+        // A guest that has nothing to compensate would be as fast in both.
+        let (lost, compensated) = (number(6), number_after(row[6], " / "));
+        assert!(lost > 0.0 && compensated > 0.0, "{row:?}");
+        assert!(times.is_finite() && times > 0.9, "compensation costs, but for what a clock is off: {row:?}");
     }
 }
 
@@ -443,15 +482,47 @@ fn the_default_is_told_of_our_own_body() {
     let part = Part::of("default");
     assert_eq!(part.text.matches("The own body, ").count(), 2, "{}", part.text);
     assert!(!part.text.contains("bunny"), "{}", part.text);
+    assert!(part.text.contains("have linear elasticity (`BakeConfig::linear`)"), "{}", part.text);
     let (four, ten) = part.text.split_once("ten-node tetrahedra (the default of the bake)").unwrap();
-    let pulls = |text| -> Vec<f64> {
+    let (ten, reduced) = ten.split_once("as it is baked by default: reduced elasticity").unwrap();
+    let pulls = |text: &str| -> Vec<Pulled> {
         let rows = Part::table(text, "| pulled by, % of the size |");
-        rows.iter().map(|row| number_after(row[0], "")).collect()
+        // What has no full solution has no numbers.
+        let solved = rows.iter().filter(|row| !row[1].starts_with("no nonlinear solution"));
+        solved.map(|row| Pulled::of(row)).collect()
     };
-    let (four, ten) = (pulls(four), pulls(ten));
-    assert_eq!((four.len(), ten.len()), (4, 2));
-    assert!(four.windows(2).chain(ten.windows(2)).all(|pair| pair[0] < pair[1]), "{four:?}, {ten:?}");
+    let [of_four, of_ten, of_reduced] = [four, ten, reduced].map(pulls);
+    println!("{of_four:#?}\n{of_ten:#?}\n{of_reduced:#?}");
+    assert!(of_four.len() >= 3 && of_ten.len() == 2 && of_reduced.len() == 2, "{}", part.text);
+    for rows in [&of_four, &of_ten, &of_reduced] {
+        assert!(rows.windows(2).all(|pair| pair[0].by < pair[1].by), "{rows:?}");
+        for row in rows {
+            assert!(row.rms <= row.most + 0.005 && row.most < 0.15 * row.by, "{row:?}");
+            // A part of the error is no more than all of it, which has no decimal.
+            assert!(row.along <= row.whole + 0.55, "{row:?}");
+            assert!(0.0 < row.step_us && row.step_us < 1_000.0, "{row:?}");
+        }
+    }
+    for rows in [&of_four, &of_ten] {
+        // Linear forces are right for small pulls only. The warp is what the shape has it from.
+        assert!(rows[0].along < 15.0 && rows.iter().all(|row| row.along < 80.0), "{rows:?}");
+        let last = rows.last().unwrap();
+        assert!(last.most < 0.7 * last.bare_most && last.whole < last.bare_whole, "{last:?}");
+    }
+    for (linear, reduced) in of_ten.iter().zip(&of_reduced) {
+        assert!(reduced.along < 10.0 && reduced.whole < 0.5 * linear.whole, "{linear:?}, {reduced:?}");
+    }
+    // The words have the figures of the tables.
     assert!(part.text.contains("In other words: if the own body is pulled by "), "{}", part.text);
+    for (text, row) in [(four, &of_four[2]), (ten, &of_ten[1])] {
+        let seen = number_after(text, "no visible point is further than ");
+        let felt = number_after(text, "The force along the pull has an error of ");
+        assert!((seen - row.most).abs() < 1e-9 && (felt - row.along).abs() < 0.56, "{seen}, {felt}, {row:?}");
+    }
+    let told = ["has an error of ", "the whole force one of ", "no visible point is further than "];
+    let [along, whole, most] = told.map(|before| number_after(reduced, before));
+    let row = &of_reduced[1];
+    assert_eq!([along, whole, most], [row.along, row.whole, row.most], "{row:?}");
 }
 
 #[test]

@@ -59,8 +59,33 @@ pub(crate) fn processor() -> String {
     line.map_or(String::new(), |(_, name)| name.trim().to_owned())
 }
 
-/// A line that says when, in which time, by which command and on which machine something was made.
-/// `load` is that at the start, `seeds` the words on them.
+/// What git says in the current directory. `None` if there is no git or it fails.
+fn git(arguments: &[&str]) -> Option<String> {
+    let output = std::process::Command::new("git").args(arguments).output().ok()?;
+    output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// Words on the commit that is checked out where the program runs. Empty outside a checkout of this
+/// project, whose commit would say nothing about the program, and without git.
+fn commit() -> String {
+    let of_this = git(&["rev-parse", "--verify", "--quiet", "HEAD:crates/pliant_lab/src/machine.rs"]);
+    let Some(commit) = of_this.and_then(|_| git(&["rev-parse", "--short", "HEAD"])) else {
+        return String::new();
+    };
+    // Files are only looked at, so that no lock of another git is in the way.
+    let status = git(&["--no-optional-locks", "status", "--porcelain", "--untracked-files=no"]);
+    let changed = if status.is_some_and(|status| has_code(&status)) { " (changed)" } else { "" };
+    format!(" at commit {}{changed}", commit.trim())
+}
+
+/// Returns whether a short status of git has a file of Rust or of Cargo.
+fn has_code(status: &str) -> bool {
+    let mut paths = status.lines().flat_map(|line| line.split(" -> "));
+    paths.any(|path| [".rs", ".toml"].iter().any(|kind| path.trim_end_matches('"').ends_with(*kind)))
+}
+
+/// A line that says when, in which time, by which command, from which commit and on which machine
+/// something was made. `load` is that at the start, `seeds` the words on them.
 pub(crate) fn made(command: &str, seconds: f64, seeds: &str, load: Option<f64>) -> String {
     let days = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)
@@ -71,9 +96,12 @@ pub(crate) fn made(command: &str, seconds: f64, seeds: &str, load: Option<f64>) 
         (Some(before), Some(after)) => format!(" Load {before:.1} at the start and {after:.1} at the end."),
         _ => String::new(),
     };
+    // What takes less than half a second would take none.
+    let seconds = if seconds < 9.95 { format!("{seconds:.1}") } else { format!("{seconds:.0}") };
     format!(
-        "*Made on {y:04}-{m:02}-{d:02} in {seconds:.0} s by `{command}`: Pliant {}, {cores} cores{}, {} {}, {}. {seeds}.{load}{}*",
+        "*Made on {y:04}-{m:02}-{d:02} in {seconds} s by `{command}`: Pliant {}{}, {cores} cores{}, {} {}, {}. {seeds}.{load}{}*",
         env!("CARGO_PKG_VERSION"),
+        commit(),
         match processor() {
             name if name.is_empty() => name,
             name => format!(" of {name}"),
@@ -120,5 +148,23 @@ mod tests {
         assert_eq!(super::date(0), [1970, 1, 1]);
         assert_eq!(super::date(11_016), [2000, 2, 29]);
         assert_eq!(super::date(20_819), [2027, 1, 1]);
+    }
+
+    #[test]
+    fn a_changed_program_is_told_from_a_changed_page() {
+        assert!(super::has_code(" M docs/report/report.md\n M crates/pliant_lab/src/lib.rs\n"));
+        assert!(super::has_code("M  Cargo.toml\n"));
+        assert!(super::has_code("R  a.rs -> b.txt\n"));
+        assert!(super::has_code(" M \"crates/\\303\\244.rs\"\n"));
+        assert!(!super::has_code(" M docs/report/report.md\n M docs/report/a-bar-pull.csv\n"));
+        assert!(!super::has_code(""));
+    }
+
+    #[test]
+    fn a_short_time_has_a_decimal() {
+        let made = |seconds| super::made("command", seconds, "No seed", None);
+        assert!(made(0.32).contains(" in 0.3 s by `command`: Pliant "), "{}", made(0.32));
+        assert!(made(9.94).contains(" in 9.9 s by ") && made(9.96).contains(" in 10 s by "));
+        assert!(made(75.4).contains(" in 75 s by "));
     }
 }

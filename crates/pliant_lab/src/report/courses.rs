@@ -25,6 +25,9 @@ const LATE: u16 = 50;
 /// Values beyond this share of the largest true value are drawn at it, %.
 const DRAWN: f64 = 150.0;
 
+/// What is alike in all of these figures, and what the default has and the paper's ways do not.
+const ALIKE: &str = "The body has linear elasticity, and the hands have no tremor. The paper's ways have no repeats and no playout delay here, as in the paper. The default repeats each tick in the next three frames and shows it one tick later. A tick that is lost alone therefore arrives in time, so that at the 22 losses at random the default shows what it shows without loss.";
+
 /// A figure of the paper: its number, its title and its lines.
 struct Course {
     number: u8,
@@ -165,7 +168,7 @@ fn figure(course: &Course, force: bool) -> Figure {
         course.lines.iter().map(|(name, f)| Series::new(name.clone(), points(f, of))).collect::<Vec<_>>()
     };
     let what = if force { "force" } else { "shape" };
-    let mut words = format!("{} ", course.words);
+    let mut words = format!("{} {ALIKE} ", course.words);
     if force {
         words.push_str("The figure shows the force on the first hand along its largest reach, and below it, for each line with its own scale, what was shown less what was true. Lines that hide each other above agree. *True* is of the paper's host; that of the default has the exact step and moves a little otherwise, and each line is compared with its own host.");
     } else {

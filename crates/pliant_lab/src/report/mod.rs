@@ -106,8 +106,8 @@ impl Part {
             Self::Modes => "b. Modes kept",
             Self::Steps => "c. Integrator and step",
             Self::Warp => "d. Warp against a nonlinear solution",
-            Self::Precision => "e. Precision",
-            Self::Frames => "e. Quantized frames",
+            Self::Precision => "e1. Precision",
+            Self::Frames => "e2. Quantized frames",
             Self::Network => "f. Network",
             Self::Front => "g. All together",
             Self::Elasticity => "h. Elasticity",
@@ -117,6 +117,20 @@ impl Part {
             Self::Courses => "The paper's figures 6, 7, 8 and 9",
             Self::Default => "The default at run time, in words",
         }
+    }
+
+    /// Returns whether the figures of the part are of linear elasticity, and need to say so.
+    fn is_linear(self) -> bool {
+        matches!(
+            self,
+            Self::Modes
+                | Self::Steps
+                | Self::Warp
+                | Self::Precision
+                | Self::Frames
+                | Self::Network
+                | Self::Front
+        )
     }
 }
 
@@ -179,7 +193,15 @@ pub fn write(
         let mut text = String::new();
         for figure in &figures {
             plot::write(folder, figure)?;
-            let _ = writeln!(text, "![{}]({}.svg)\n\n{}", figure.title, figure.file, figure.words);
+            let _ = writeln!(
+                text,
+                "![{}]({}.svg)\n\n{}\n\n{}{}",
+                figure.title,
+                figure.file,
+                figure.data(),
+                figure.words,
+                if part.is_linear() { LINEAR } else { "" }
+            );
             if let Some(error) = figure.reference_error {
                 let _ = writeln!(text, "The error of the reference is about {error:.1e}.");
             }
@@ -250,7 +272,7 @@ fn measure(
             (Vec::new(), tables::table_2(models, own, size, progress)?)
         }
         Part::Table2Repair => {
-            let size = if quick { (1.0, 40) } else { (10.0, 4) };
+            let size = if quick { (2.0, 40) } else { (10.0, 4) };
             (Vec::new(), tables::table_2_repair(models, own, size, progress)?)
         }
         Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
@@ -280,7 +302,10 @@ fn rows(figure: &Figure) -> String {
     out
 }
 
-const HEADING: &str = "# Cost and accuracy of Pliant\n\nEach part says by which command it was made, when, and on which machine. Unless stated otherwise, times are those of one thread that is pinned to one core. They are medians after a warm-up, with the 99th percentile beside them (whiskers in the figures). The load of a machine is the mean number of runnable programs over a minute. The report itself counts as one, and bakes use all cores. If the load is higher than that, the times are too long, and only ratios within a part are meaningful.\n";
+/// What the text of a figure of linear elasticity ends with.
+const LINEAR: &str = " The modal body has linear elasticity, and what is called the default is the default of that: a bake's own is reduced elasticity (figure h).";
+
+const HEADING: &str = "# Cost and accuracy of Pliant\n\nEach part says by which command it was made, when, and on which machine. Unless stated otherwise, times are those of one thread that is pinned to one core. They are medians after a warm-up, with the 99th percentile beside them (whiskers in the figures). The load of a machine is the mean number of runnable programs over a minute. The report itself counts as one, and bakes use all cores. If the load is higher than that, the times are too long, and only ratios within a part are meaningful. Below each figure is its data; the same picture lies beside it as PNG.\n";
 
 /// A line that says how a part was made.
 fn stamp(part: Part, quick: bool, seconds: f64, load: Option<f64>) -> String {

@@ -24,7 +24,7 @@ use crate::{
 /// The step, s.
 const STEP: f64 = 0.025;
 /// Playout delay, ticks, and repeats of the table in which all ways have the same.
-const EQUAL: (u8, u8) = (1, 3);
+pub(super) const EQUAL: (u8, u8) = (1, 3);
 /// The first seed of the search for each way's best settings. What is shown has other seeds, those
 /// from [`Experiment::SEED`] on.
 const SEARCH_SEED: u64 = 101;

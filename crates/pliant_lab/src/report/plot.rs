@@ -85,6 +85,12 @@ impl Figure {
         files.extend(self.below.iter().map(|below| format!("{}.csv", below.file)));
         files
     }
+
+    /// Links to the figure's CSV files.
+    pub(super) fn data(&self) -> String {
+        let below = self.below.iter().map(|below| format!(", [data of the small plots]({}.csv)", below.file));
+        format!("[data]({}.csv){}", self.file, below.collect::<String>())
+    }
 }
 
 /// Width of a picture, and height of its main plot.

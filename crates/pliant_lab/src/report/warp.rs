@@ -26,11 +26,14 @@ pub(super) struct HeldBar {
     pub(super) step_us: [f64; 2],
 }
 
+/// Holds a body where a nonlinear solution has its patches. If `own_shapes`, a body with reduced
+/// elasticity has the own shapes of these patches.
 pub(super) fn held_as(
     model: &Arc<ModalModel>,
     load: &[DeadLoad],
     truth: &Deflection,
     body_config: BodyConfig,
+    own_shapes: bool,
 ) -> Result<HeldBar, LabError> {
     let mut body = Body::new(model.clone(), body_config)?;
     let mut grabs = Vec::new();
@@ -41,6 +44,9 @@ pub(super) fn held_as(
     }
     // The targets move slowly, as a hand does.
     for i in 0..3_000 {
+        if own_shapes {
+            body.make_held_shapes()?;
+        }
         let s = crate::smooth(f64::from(i) / 600.0);
         for (grab, start, moved) in &grabs {
             body.set_target(*grab, std::array::from_fn(|k| start[k] + s * moved[k]))?;
@@ -107,6 +113,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
                 &load,
                 &truth,
                 BodyConfig::from(StepSettings { warp, ..Default::default() }),
+                false,
             )?;
             bend[which].push((reach, held.shape[1]));
             force[which].push((reach, held.along));
@@ -125,6 +132,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
                 &load,
                 &truth,
                 BodyConfig::from(StepSettings { warp, ..Default::default() }),
+                false,
             )?;
             twist[which].push((turn, held.shape[1]));
         }

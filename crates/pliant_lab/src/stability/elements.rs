@@ -1,6 +1,8 @@
 //! The force in a hand beside full finite elements, which neither modes nor baked flexibilities
 //! enter: of the same mesh, so that what the body leaves out shows, and of a fine mesh, so that
-//! locking and the coarseness of the mesh show.
+//! locking and the coarseness of the mesh show. Where elasticity is linear, these are the elements
+//! of [`Solid`], which share no line with the bake's. For large strains they are those of the bake
+//! ([`deflect`]), so that only what the reduction leaves out shows.
 
 use std::sync::{Arc, OnceLock};
 
@@ -20,6 +22,9 @@ use crate::{
 };
 
 const FORCE: &str = "|force - full finite elements| / full finite elements";
+
+/// The same beside the bake's own full solution for large strains.
+const OWN: &str = "|force - full solution of the bake| / full solution of the bake";
 
 const LOCKS: &str = "four-node elements have one strain each and are too stiff where the body bends or keeps its volume; they are there for speed, and ten-node elements are the default";
 
@@ -62,13 +67,17 @@ impl Form {
         }
     }
 
+    /// Nodes whose x is below this are held, m.
+    fn held(self) -> f64 {
+        if self == Self::Ball { -0.3 } else { 1e-9 }
+    }
+
     fn config(self, element: Element) -> BakeConfig {
-        let bound = if self == Self::Ball { -0.3 } else { 1e-9 };
         BakeConfig {
             element,
             modes: 24,
             damping: Damping::Ratio(0.3),
-            anchors: vec![Anchor { axis: 0, comparison: Comparison::Less, bound }],
+            anchors: vec![Anchor { axis: 0, comparison: Comparison::Less, bound: self.held() }],
             ..BakeConfig::linear()
         }
     }
@@ -130,7 +139,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         let name = format!("bar 10 : 1, nu {poisson}, the fine mesh beside Timoshenko's beam");
         out.push(Case::new(group, name, move || {
             let beam = timoshenko(BakeConfig::linear().young, poisson, 1.0, 0.1);
-            Ok(off(displacements(poisson)?, Vector3::from(BEND) * -beam, limit))
+            Ok(off(FORCE, slender_solid(poisson)?, Vector3::from(BEND) * -beam, limit))
         }));
     }
     for element in [Element::Tet4, Element::Tet10] {
@@ -138,7 +147,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             let [x, y, z] = cells;
             let name = format!("bar 10 : 1, nu {SOFT}, {element}, {x} x {y} x {z} cells, beside a fine mesh");
             let case = Case::new(group, name, move || {
-                Ok(off(bent(element, cells, SOFT)?, nearly_incompressible()?, 0.05))
+                Ok(off(FORCE, bent(element, cells, SOFT)?, nearly_incompressible()?, 0.05))
             });
             let known: Option<(&str, &[_])> = match (element, cells) {
                 (Element::Tet10, _) => None,
@@ -176,25 +185,47 @@ fn made(mesh: &TetMesh, config: &BakeConfig) -> Result<Arc<ModalModel>, LabError
     Ok(Arc::new(bake(mesh, None, config, &mut |_, _| ())?.model))
 }
 
-/// The force of full finite elements on a hand, N: by linear theory, or with a material for large
-/// strains.
-fn full(
+/// The surface of a mesh, in a model of as little as possible, and the patch of a hand on it.
+fn patch_on(
+    mesh: &TetMesh,
+    element: Element,
+    form: Form,
+    at: [f64; 3],
+    radius: f64,
+) -> Result<(Arc<ModalModel>, Patch), LabError> {
+    // The surface of a model is that of its mesh, and one mode suffices for it.
+    let model = made(mesh, &BakeConfig { modes: 1, sites: Some(1), ..form.config(element) })?;
+    let patch = Patch::around(model.surface(), nearest_vertex(&model, at), radius)?;
+    Ok((model, patch))
+}
+
+/// The force of full finite elements on a hand by linear theory, N: those of the matrix, of
+/// displacements alone.
+fn solid(
+    form: Form,
     at: [f64; 3],
     mesh: &TetMesh,
     config: &BakeConfig,
-    material: Option<Material>,
     held: HandPull,
 ) -> Result<Vector3<f64>, LabError> {
-    // The surface of a model is that of its mesh, and one mode suffices for it.
-    let least = BakeConfig { modes: 1, sites: Some(1), material: None, ..config.clone() };
-    let model = made(mesh, &least)?;
-    let vertex = nearest_vertex(&model, at);
-    let patch = Patch::around(model.surface(), vertex, held.radius)?;
+    let (model, patch) = patch_on(mesh, config.element, form, at, held.radius)?;
+    let solid = Solid::new(mesh, config.element, lame(config.young, config.poisson), form.held());
+    Ok(solid.reaction(model.surface(), &patch, held.by))
+}
+
+/// The force of the bake's own full solution on a hand, N, with a material for large strains.
+fn full_solution(
+    form: Form,
+    mesh: &TetMesh,
+    config: &BakeConfig,
+    material: Material,
+    held: HandPull,
+) -> Result<Vector3<f64>, LabError> {
+    let (_, patch) = patch_on(mesh, config.element, form, form.place(), held.radius)?;
     let prescribed = [PrescribedPatch { patch, displacement: held.by }];
     let loads = StaticLoads { prescribed: &prescribed, ..StaticLoads::default() };
-    let solved = deflect(mesh, config, material.unwrap_or(Material::StVenantKirchhoff), &loads)?;
-    let forces = if material.is_some() { solved.reactions } else { solved.linear_reactions };
-    Ok(forces.first().map_or_else(|| Vector3::repeat(f64::NAN), |force| (*force).into()))
+    let solved = deflect(mesh, config, material, &loads)?;
+    Ok(solved.reactions.first().map_or_else(|| Vector3::repeat(f64::NAN), |force| (*force).into()))
 }
 
 /// The force of the body on a hand, N, when it is at rest.
@@ -208,8 +239,8 @@ fn static_reaction(
     Ok(pull(model, &hand)?.reaction.into())
 }
 
-fn off(got: Vector3<f64>, want: Vector3<f64>, limit: f64) -> CaseOutcome {
-    CaseOutcome::of(vec![Bound::new(FORCE, (got - want).norm() / want.norm(), limit)])
+fn off(what: &'static str, got: Vector3<f64>, want: Vector3<f64>, limit: f64) -> CaseOutcome {
+    CaseOutcome::of(vec![Bound::new(what, (got - want).norm() / want.norm(), limit)])
 }
 
 fn same_mesh(form: Form, config: &BakeConfig, held: HandPull) -> Result<CaseOutcome, LabError> {
@@ -217,7 +248,7 @@ fn same_mesh(form: Form, config: &BakeConfig, held: HandPull) -> Result<CaseOutc
     let got = static_reaction(form.place(), &made(&mesh, config)?, Elasticity::Linear, held)?;
     // In the bar the patch is a large part of the end, and all of it moves alike.
     let limit = if form == Form::Bar && config.sites.is_some() { 5e-3 } else { 0.02 };
-    Ok(off(got, full(form.place(), &mesh, config, None, held)?, limit))
+    Ok(off(FORCE, got, solid(form, form.place(), &mesh, config, held)?, limit))
 }
 
 /// Edges of a slender bar that a hand at its end bends, so that the shape of the patch matters
@@ -241,30 +272,33 @@ fn bent(element: Element, cells: [usize; 3], poisson: f64) -> Result<Vector3<f64
 }
 
 fn fine_mesh(element: Element, cells: [usize; 3]) -> Result<CaseOutcome, LabError> {
-    let config = Form::Bar.config(Element::Tet10);
-    let got = bent(element, cells, config.poisson)?;
-    let want = full(END, &shapes::bar(FINE, SLENDER)?, &config, None, SLENDER_HAND)?;
-    Ok(off(got, want, if cells[0] == 5 { 0.05 } else { 0.02 }))
+    static FORCE_OF_MESH: OnceLock<Vector3<f64>> = OnceLock::new();
+    let poisson = Form::Bar.config(element).poisson;
+    let got = bent(element, cells, poisson)?;
+    let limit = if cells[0] == 5 { 0.05 } else { 0.02 };
+    Ok(off(FORCE, got, once(&FORCE_OF_MESH, poisson)?, limit))
 }
 
-/// [`displacements`] of a body that hardly changes its volume. Several cases share it.
+/// [`slender_solid`] of a body that hardly changes its volume. (Above a Poisson ratio of 0.45 the
+/// bake averages the pressure, and its static solution refuses the material.)
 fn nearly_incompressible() -> Result<Vector3<f64>, LabError> {
-    static FORCE: OnceLock<Vector3<f64>> = OnceLock::new();
-    if let Some(force) = FORCE.get() {
+    static FORCE_OF_MESH: OnceLock<Vector3<f64>> = OnceLock::new();
+    once(&FORCE_OF_MESH, SOFT)
+}
+
+/// [`slender_solid`] for several cases that share it.
+fn once(force: &OnceLock<Vector3<f64>>, poisson: f64) -> Result<Vector3<f64>, LabError> {
+    if let Some(force) = force.get() {
         return Ok(*force);
     }
-    let force = displacements(SOFT)?;
-    Ok(*FORCE.get_or_init(|| force))
+    let solved = slender_solid(poisson)?;
+    Ok(*force.get_or_init(|| solved))
 }
 
-/// The force of the fine mesh by elements of displacements alone, N. (Above a Poisson ratio of 0.45
-/// the bake averages the pressure, and its static solution refuses the material.)
-fn displacements(poisson: f64) -> Result<Vector3<f64>, LabError> {
-    let (mesh, config) = (shapes::bar(FINE, SLENDER)?, Form::Bar.config(Element::Tet10));
-    let least = made(&mesh, &BakeConfig { modes: 1, sites: Some(1), ..config.clone() })?;
-    let patch = Patch::around(least.surface(), nearest_vertex(&least, END), SLENDER_HAND.radius)?;
-    let solid = Solid::new(&mesh, Element::Tet10, lame(config.young, poisson), 1e-9);
-    Ok(solid.reaction(least.surface(), &patch, BEND))
+/// The force of the fine mesh of a slender bar, N.
+fn slender_solid(poisson: f64) -> Result<Vector3<f64>, LabError> {
+    let config = BakeConfig { poisson, ..Form::Bar.config(Element::Tet10) };
+    solid(Form::Bar, END, &shapes::bar(FINE, SLENDER)?, &config, SLENDER_HAND)
 }
 
 fn reduced(material: Material, by: [f64; 3]) -> Result<CaseOutcome, LabError> {
@@ -276,5 +310,5 @@ fn reduced(material: Material, by: [f64; 3]) -> Result<CaseOutcome, LabError> {
         ..form.config(Element::Tet10)
     };
     let got = static_reaction(form.place(), &made(&mesh, &config)?, Elasticity::Reduced, held)?;
-    Ok(off(got, full(form.place(), &mesh, &config, Some(material), held)?, 0.03))
+    Ok(off(OWN, got, full_solution(form, &mesh, &config, material, held)?, 0.03))
 }

@@ -4,7 +4,8 @@
 //! its tightest bound, at most 1e12: with 1 the bound just holds, with 10 it holds ten times over.
 //! In cases with hands, the paper's plain scheme (average acceleration, hands as rigid position
 //! constraints) runs the same script, and its result stands beside. Over networks it is the paper's
-//! repair, and none, with the paper's integrator at both ends.
+//! repair, and none, with the default's repeats and playout delay, and with the paper's integrator
+//! at both ends.
 
 mod bodies;
 mod contact;
@@ -231,7 +232,9 @@ impl Verdict {
     /// What [`Verdict::plain`] is the result of.
     pub fn papers_way(&self) -> &'static str {
         match self.group {
-            network::GROUP => "the paper's repair with the paper's integrator, and no repair",
+            network::GROUP => {
+                "the paper's repair, and none, with the paper's integrator, our repeats and our delay"
+            }
             _ => "the paper's plain scheme",
         }
     }

@@ -18,6 +18,25 @@ alike are one case for the arithmetic, in other units. The column of dynamics co
 differ. Numbers far below 1e-9 are rounding, and differ from processor to processor. A tool at 0 m/s
 is held by the friction of its device, 0.26 N as in a Touch, but where a case has none.
 
+The references of forces are these:
+
+- `|reaction - static|` is measured from the compliance of the body itself, its modes and its baked
+  flexibilities. It shows what the steps do, and not what the bake left out.
+- Full finite elements of linear elasticity are those of
+  `crates/pliant_lab/src/stability/solid.rs`. They were written for the matrix, share no line with
+  those of the bake, and have Timoshenko's beam beside them.
+- Reduced elasticity has the full solution of the bake itself, `deflect`, beside it. It shows what
+  the reduction leaves out, and no fault that both have.
+- A falling block is measured from a column under its own weight, whose center sinks by
+  rho g H^2 / (3 E).
+- Without friction, the force of a device at rest is that of the coupling and of full finite
+  elements, one after the other. The coupling has the stiffness to which it is set, so that a
+  setting that is wrong does not show there.
+
+Over networks, the paper's repair and none stand beside the default. They have its three repeats and
+its playout delay of one tick, and the paper's integrator at both ends. What they show is told and
+has no bound.
+
 ";
 
 impl StabilityReport {
