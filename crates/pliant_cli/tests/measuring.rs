@@ -430,7 +430,7 @@ fn the_stability_matrix_keeps_its_bounds_and_is_the_committed_page() {
         limits += usize::from(limit);
         with_the_papers_scheme += usize::from(case["plain"].is_string());
     }
-    assert!(with_the_papers_scheme >= 40 && limits == 16, "{with_the_papers_scheme}, {limits}");
+    assert!(with_the_papers_scheme >= 40 && limits == 48, "{with_the_papers_scheme}, {limits}");
     let committed = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/report/stability.md");
     let rows = |path: &str| -> Vec<Row> {
         let text = std::fs::read_to_string(path).unwrap();
