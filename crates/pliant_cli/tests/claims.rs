@@ -488,7 +488,7 @@ fn other_programs_take_as_long_as_was_measured() {
     let others = of(&errors, &|name| !name.starts_with("Pliant"));
     // The times of the others stand beside the error of the body by whose time they are divided.
     let beside = of(&table("peers-error", "ratio_median"), &|name| !name.starts_with("Pliant"));
-    says_range(DECISIONS, "A second of a hanging bar takes PyBullet, MuJoCo, Exudyn or Rapier", beside);
+    says_range(DECISIONS, "that hangs still takes PyBullet, MuJoCo, Exudyn or Rapier", beside);
     says_range(DECISIONS, "which with 10 to 40 is off by", reduced);
     says_range(DECISIONS, "% of the length; they are off by", others);
     says_range(DECISIONS, "On their four-node grids ours is off by", four);
