@@ -199,6 +199,17 @@ fn the_elasticities_are_those_of_the_report() {
     let times = near.last().unwrap().0 / at("linear", 8).last().unwrap().0;
     says(DECISIONS, "with 36 coordinates at some", times);
     says("docs/performance.md", "A step of it, held by a hand, costs some", times);
+    // A hand at a corner, with each number of coordinates.
+    let errors =
+        |name: &str, way: u32| range(&at(name, way).iter().map(|point| 100.0 * point.1).collect::<Vec<_>>());
+    says_range(LIMITS, "with 12 to 36 coordinates it is off by", errors("reduced", 8));
+    says_range(LIMITS, "it is off by 1.9 to 4.9 % at 8 % and by", errors("reduced", 28));
+    let own = "reduced, with the patch's own shapes";
+    says_range(LIMITS, "at 28 % without the patch's own shapes, and by", errors(own, 8));
+    says_range(LIMITS, "own shapes, and by 0.1 to 1.5 % and", errors(own, 28));
+    let corner = row(LIMITS, "  | leads a corner of the end sideways by 8 / 28 %");
+    assert_eq!(corner[2], "0.1 to 1.5 / 0.3 to 2.4 %");
+    assert_eq!(corner[3], "1.9 to 4.9 / 7.9 to 16.6 %");
 }
 
 #[test]
