@@ -407,6 +407,18 @@ fn the_stability_matrix_is_told_as_its_page_counts_it() {
     says(MEASUREMENTS, "`pliant stability` runs", cases);
     says(MEASUREMENTS, "of the cases state these:", dynamics);
     says(MEASUREMENTS, "within 1e-9 of Coulomb's law. The", limits);
+    // Which of its references are ours.
+    let full = row("docs/report/stability.md", "| full elements |");
+    says(QUESTIONS, "are, in 46 of the", number(&full[1]).0);
+    let bounds = read("docs/report/stability.md");
+    let cases = |bound: &str| {
+        let row = bounds.lines().find_map(|line| line.strip_prefix(bound)).unwrap();
+        number(row).0
+    };
+    let statics = cases(r"| \|reaction - static\| / static |");
+    says(QUESTIONS, "\"Static\", in", statics);
+    let own = cases(r"| \|reaction - full finite elements\| / full finite elements |");
+    assert_eq!([statics, own], [45.0, 13.0], "as {MEASUREMENTS} says");
 }
 
 #[test]
