@@ -4,8 +4,9 @@ A bar of 1 m x 0.05 m x 0.05 m (E 2.9e6 Pa, nu 0.3, 1000 kg/m^3) is fixed at one
 half the gravity of the earth, which bends its end down by two thirds of its length. The reference
 is none of the programs: it is the heavy elastica, E I t'' = w (L - s) cos t, solved here. Each
 program gets meshes of several sizes, comes to rest in its own way, and is told its error (how far
-its end is from the elastica's, in percent of the length) beside the time of a step and of a second
-of motion, one thread each. Rounds are by turns with one row of ours. `run.py` calls this.
+its end is from the elastica's, in percent of the length) beside the time of a step and of the steps
+of a second, one thread each. These steps are at rest or near it: `run.py`, which calls this, says
+which they are. Rounds are by turns with one row of ours.
 """
 
 import json, pathlib, sys, tempfile, time, warnings
@@ -47,8 +48,8 @@ def elastica():
 def settle(step, where, second, beside, rounds, seconds=100):
     """Steps until the end stays where it is.
 
-    Returns where that is, and rounds of our time and its, of a second of motion, ms. `second`:
-    steps of a second. `beside`: measures ours.
+    Returns where that is, and rounds of our time and its, of the steps of a second at rest, ms.
+    `second`: steps of a second. `beside`: measures ours.
     """
     last = where()
     for _ in range(seconds):
@@ -128,7 +129,7 @@ class Ours:
         return (moved[end] - rest[end]).mean(axis=0)[:2]
 
     def time(self):
-        """Of a second of motion, ms."""
+        """Of the steps of a second, ms: the median of 4,000 at least, to rest and on."""
         return self.pull(GRAVITY)["step_us"]["p50"] * 60 * 1e-3
 
 
@@ -360,7 +361,7 @@ def measure(pliant, folder, quick):
 
 def table(rows):
     """Lines of Markdown."""
-    lines = ["| program | size | nodes of each | the end is off by, % of the length | end along and down, m | a step, us | a second of motion, ms | times 20 coordinates of ours, median (least to most) |",
+    lines = ["| program | size | nodes of each | the end is off by, % of the length | end along and down, m | a step, us | the steps of a second, ms | times 20 coordinates of ours, median (least to most) |",
              "| --- | --- | --- | --- | --- | --- | --- | --- |"]
     for r in rows:
         cells = [r["program"], r["size"], str(r["nodes"])]
@@ -374,7 +375,7 @@ def table(rows):
 
 
 def draw(rows, path):
-    """Error against the time of a second of motion, both on logarithmic axes, as SVG."""
+    """Error against the time of the steps of a second, both on logarithmic axes, as SVG."""
     width, height, left, top, right, bottom = 980, 540, 80, 30, 310, 60
     told = [r for r in rows if r["error_percent"] is not None]
     if not told:
@@ -397,7 +398,7 @@ def draw(rows, path):
             out.append(f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}" stroke="#bbb"/>')
             where = f'x="{a[0]:.1f}" y="{a[1] + 20:.1f}" text-anchor="middle"' if axis == 0 else f'x="{a[0] - 8:.1f}" y="{a[1] + 5:.1f}" text-anchor="end"'
             out.append(f"<text {where}>{10.0**tick:g}</text>")
-    out.append(f'<text x="{(left + width - right) / 2}" y="{height - 15}" text-anchor="middle">time for a second of motion on one core, ms</text>')
+    out.append(f'<text x="{(left + width - right) / 2}" y="{height - 15}" text-anchor="middle">time of the steps of a second on one core, near rest, ms</text>')
     out.append(f'<text transform="translate(20 {height / 2}) rotate(-90)" text-anchor="middle">the end is off by, % of the length</text>')
     # Filled: ten nodes. Hollow: four. Squares: other meshes.
     for i, name in enumerate(dict.fromkeys(r["program"] for r in told)):
