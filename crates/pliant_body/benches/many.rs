@@ -2,8 +2,8 @@
 //! plugin: of 20 modes resting, in motion, and in motion with a hand each, and of 60 modes with a
 //! hand each. The frame of an app without bodies is subtracted.
 //!
-//! `cargo bench -p pliant_body --features bake,bevy/multi_threaded --bench many`. With the name of a
-//! case, only that one runs, which is what a profiler wants.
+//! `cargo bench -p pliant_body --features bake,bevy/multi_threaded --bench many`. With the name of
+//! a case, only that one runs, which is what a profiler wants.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a bench may stop")]
 
 use std::{sync::Arc, time::Instant};
