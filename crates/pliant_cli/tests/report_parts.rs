@@ -494,23 +494,24 @@ fn the_default_is_told_of_our_own_body() {
     let [of_four, of_ten, of_reduced] = [four, ten, reduced].map(pulls);
     println!("{of_four:#?}\n{of_ten:#?}\n{of_reduced:#?}");
     assert!(of_four.len() >= 3 && of_ten.len() == 2 && of_reduced.len() == 2, "{}", part.text);
-    for rows in [&of_four, &of_ten, &of_reduced] {
+    // The hand dents the ten-node body, which modes do not show without the shapes of its patch.
+    for (rows, most) in [(&of_four, 0.05), (&of_ten, 0.5), (&of_reduced, 0.03)] {
         assert!(rows.windows(2).all(|pair| pair[0].by < pair[1].by), "{rows:?}");
         for row in rows {
-            assert!(row.rms <= row.most + 0.005 && row.most < 0.15 * row.by, "{row:?}");
+            assert!(row.rms <= row.most + 0.005 && row.most < most * row.by, "{row:?}");
             // A part of the error is no more than all of it, which has no decimal.
             assert!(row.along <= row.whole + 0.55, "{row:?}");
             assert!(0.0 < row.step_us && row.step_us < 1_000.0, "{row:?}");
         }
     }
-    for rows in [&of_four, &of_ten] {
-        // Linear forces are right for small pulls only. The warp is what the shape has it from.
-        assert!(rows[0].along < 15.0 && rows.iter().all(|row| row.along < 80.0), "{rows:?}");
+    // Linear forces are right for small pulls only, and the warp is what the shape has it from.
+    for (rows, gain) in [(&of_four, 0.3), (&of_ten, 1.0)] {
+        assert!(rows[0].along < 3.0 && rows.iter().all(|row| row.along < 30.0), "{rows:?}");
         let last = rows.last().unwrap();
-        assert!(last.most < 0.7 * last.bare_most && last.whole < last.bare_whole, "{last:?}");
+        assert!(last.most < gain * last.bare_most && last.whole < 0.7 * last.bare_whole, "{last:?}");
     }
     for (linear, reduced) in of_ten.iter().zip(&of_reduced) {
-        assert!(reduced.along < 10.0 && reduced.whole < 0.5 * linear.whole, "{linear:?}, {reduced:?}");
+        assert!(reduced.along < 3.0 && reduced.whole < 0.2 * linear.whole, "{linear:?}, {reduced:?}");
     }
     // The words have the figures of the tables.
     assert!(part.text.contains("In other words: if the own body is pulled by "), "{}", part.text);
