@@ -48,7 +48,7 @@ pub(crate) struct Ball {
     /// Whether the site may lead.
     pub(crate) leads: bool,
     /// Cosine of the angle up to which the contact point slides where the site leads.
-    reach: f64,
+    pub(super) reach: f64,
     /// Compliance without the half-space, along the normal and across it, at the baked stiffness,
     /// m/N.
     fixed: [f64; 2],
