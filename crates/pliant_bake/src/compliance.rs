@@ -13,7 +13,7 @@ use faer::linalg::matmul::matmul;
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::prelude::{IntoConst, ReborrowMut};
 use faer::traits::ComplexField;
-use faer::traits::pulp::Arch;
+use faer::traits::pulp::{Arch, NullaryFnOnce};
 use faer::{Accum, Mat, MatMut, Par};
 use rayon::prelude::*;
 
@@ -266,10 +266,7 @@ impl<T: Number> Solved<'_, T> {
     fn squares(&self, all: &[Load], loads: &[u32]) -> Vec<Six> {
         // The code is compiled for every instruction set, and the dispatch selects one at run time.
         // Every variant does the same operations in the same order.
-        Arch::new().dispatch(
-            #[inline(always)]
-            || self.squares_here(all, loads),
-        )
+        Arch::new().dispatch(Squares { solved: self, all, loads })
     }
 
     #[inline(always)]
@@ -304,6 +301,23 @@ impl<T: Number> Solved<'_, T> {
             }
         }
         out
+    }
+}
+
+/// The call of [`Solved::squares_here`]. A closure would be called through a function of its own,
+/// which is compiled for the oldest processors.
+struct Squares<'a, T> {
+    solved: &'a Solved<'a, T>,
+    all: &'a [Load],
+    loads: &'a [u32],
+}
+
+impl<T: Number> NullaryFnOnce for Squares<'_, T> {
+    type Output = Vec<Six>;
+
+    #[inline(always)]
+    fn call(self) -> Vec<Six> {
+        self.solved.squares_here(self.all, self.loads)
     }
 }
 
