@@ -18,16 +18,16 @@ use pliant_modal as modal;
 /// // Two balls that melt into each other, sampled every 2 cm.
 /// let ball = |p: [f64; 3], x: f64| ((p[0] - x).powi(2) + p[1] * p[1] + p[2] * p[2]).sqrt() - 0.3;
 /// let both = |p| -0.05 * ((-ball(p, -0.2) / 0.05).exp() + (-ball(p, 0.2) / 0.05).exp()).ln();
-/// let field = modal::DistanceField::sample([[-0.6, -0.4, -0.4], [0.6, 0.4, 0.4]], 0.02, both)?;
+/// let field = modal::DistanceGrid::sample([[-0.6, -0.4, -0.4], [0.6, 0.4, 0.4]], 0.02, both)?;
 /// let field = DistanceField::new(field);
 /// # Ok::<(), modal::StepError>(())
 /// ```
 #[derive(Asset, TypePath, Debug, Clone)]
-pub struct DistanceField(Arc<modal::DistanceField>);
+pub struct DistanceField(Arc<modal::DistanceGrid>);
 
 impl DistanceField {
     /// Makes an asset of a field, whose lengths are those of the obstacle's entity.
-    pub fn new(field: modal::DistanceField) -> Self {
+    pub fn new(field: modal::DistanceGrid) -> Self {
         Self(Arc::new(field))
     }
 
@@ -48,12 +48,12 @@ impl DistanceField {
         let bounds =
             corners.fold([DVec3::INFINITY, DVec3::NEG_INFINITY], |[low, high], p| [low.min(p), high.max(p)]);
         let distance = |p: [f64; 3]| solid.at(&p.into()).distance;
-        modal::DistanceField::sample(bounds.map(|corner| corner.to_array()), cell.into(), distance)
+        modal::DistanceGrid::sample(bounds.map(|corner| corner.to_array()), cell.into(), distance)
             .map(Self::new)
     }
 
     /// The field.
-    pub fn field(&self) -> &modal::DistanceField {
+    pub fn field(&self) -> &modal::DistanceGrid {
         &self.0
     }
 

@@ -63,7 +63,7 @@ mod warp;
 pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, GrabId};
 pub use contact::{
-    Capsule, Contact, ContactMemory, ContactReport, ContactState, Contacts, Cuboid, DistanceField,
+    Capsule, Contact, ContactMemory, ContactReport, ContactState, Contacts, Cuboid, DistanceGrid,
     FixedObstacle, FixedShape, Moving, ObstacleShape, Plane, Probe, ProbeConfig, ProbeContact, Rigid, Sphere,
     Support, SurfacePoint, Touched, contact_force,
 };

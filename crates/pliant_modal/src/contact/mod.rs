@@ -26,7 +26,7 @@
 
 mod cone;
 mod contacts;
-mod distance_field;
+mod distance_grid;
 mod fixed;
 mod indent;
 mod obstacle;
@@ -40,7 +40,7 @@ mod surface_field;
 
 pub use cone::contact_force;
 pub use contacts::{Contact, ContactMemory, ContactReport, ContactState, Contacts, Touched};
-pub use distance_field::DistanceField;
+pub use distance_grid::DistanceGrid;
 pub use fixed::{FixedObstacle, FixedShape};
 pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, SurfacePoint};
 pub use probe::{Probe, ProbeConfig, ProbeContact};

@@ -24,14 +24,14 @@ const SLACK: f64 = 0.01;
 /// bound if the grid's edge is outside the solid. Where the solid reaches that edge, it goes on
 /// without end.
 #[derive(Debug, Clone, PartialEq)]
-pub struct DistanceField {
+pub struct DistanceGrid {
     origin: Vector3<f64>,
     cell: f64,
     counts: [usize; 3],
     values: Vec<f32>,
 }
 
-impl DistanceField {
+impl DistanceGrid {
     /// Takes the distances (m) at the nodes `origin + cell [i, j, k]` (m), `counts` of them along
     /// each axis. `i` changes fastest.
     ///
@@ -41,12 +41,12 @@ impl DistanceField {
     /// differ by more than their distance: no solid has such distances, and a body that is fast
     /// could pass through.
     pub fn new(origin: [f64; 3], cell: f64, counts: [usize; 3], values: Vec<f32>) -> Result<Self, StepError> {
-        finite("origin of a distance field", &origin)?;
+        finite("origin of a distance grid", &origin)?;
         let sound = cell > 0.0 && cell.is_finite();
-        StepError::check("cell of a distance field", "finite meters above 0", sound, cell)?;
+        StepError::check("cell of a distance grid", "finite meters above 0", sound, cell)?;
         let fewest = counts.iter().copied().min().unwrap_or(0);
         StepError::check(
-            "nodes of a distance field",
+            "nodes of a distance grid",
             "4 or more along each axis",
             fewest >= 4,
             fewest as f64,
@@ -54,10 +54,10 @@ impl DistanceField {
         let all = counts.iter().try_fold(1usize, |all, count| all.checked_mul(*count));
         let expected = "as many as nodes, and at most 2^26";
         let sound = all == Some(values.len()) && values.len() <= MOST;
-        StepError::check("values of a distance field", expected, sound, values.len() as f64)?;
+        StepError::check("values of a distance grid", expected, sound, values.len() as f64)?;
         let bad = values.iter().find(|value| !value.is_finite()).copied();
         StepError::check(
-            "value of a distance field",
+            "value of a distance grid",
             "finite meters",
             bad.is_none(),
             bad.unwrap_or(0.0).into(),
@@ -65,7 +65,7 @@ impl DistanceField {
         let field = Self { origin: origin.into(), cell, counts, values };
         let steepest = field.steepest();
         let expected = "neighbors that differ by their distance at most";
-        StepError::check("slope of a distance field", expected, steepest <= 1.0 + SLACK, steepest)?;
+        StepError::check("slope of a distance grid", expected, steepest <= 1.0 + SLACK, steepest)?;
         Ok(field)
     }
 
@@ -73,20 +73,20 @@ impl DistanceField {
     /// `low` to `high` (m), and three cells more on each side.
     ///
     /// # Errors
-    /// Returns the errors of [`DistanceField::new`], and one for more than 2^26 nodes.
+    /// Returns the errors of [`DistanceGrid::new`], and one for more than 2^26 nodes.
     pub fn sample(
         [low, high]: [[f64; 3]; 2],
         cell: f64,
         mut distance: impl FnMut([f64; 3]) -> f64,
     ) -> Result<Self, StepError> {
         const MARGIN: f64 = 3.0;
-        finite("corner of a distance field", &[low, high].concat())?;
+        finite("corner of a distance grid", &[low, high].concat())?;
         let wide: [f64; 3] =
             std::array::from_fn(|k| ((high[k] - low[k]).max(0.0) / cell).ceil() + 2.0 * MARGIN);
         let all = wide.iter().map(|cells| cells + 1.0).product::<f64>();
         // Comparisons with no number are false.
         let sound = cell > 0.0 && all <= MOST as f64;
-        StepError::check("nodes of a distance field", "at most 2^26, of a cell above 0", sound, all)?;
+        StepError::check("nodes of a distance grid", "at most 2^26, of a cell above 0", sound, all)?;
         let counts = wide.map(|cells| cells as usize + 1);
         let origin: [f64; 3] = std::array::from_fn(|k| {
             // The box lies in the middle.
@@ -169,7 +169,7 @@ fn weights(t: f64) -> [(f64, f64); 4] {
     ]
 }
 
-impl ObstacleShape for DistanceField {
+impl ObstacleShape for DistanceGrid {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
         let inner = |k: usize, node: usize| self.origin[k] + self.cell * node as f64;
         let within = Vector3::from_fn(|k, _| point[k].clamp(inner(k, 1), inner(k, self.counts[k] - 2)));
@@ -202,8 +202,8 @@ mod tests {
         })
     }
 
-    fn field(shape: &impl ObstacleShape, half: f64, cell: f64) -> DistanceField {
-        DistanceField::sample([[-half; 3], [half; 3]], cell, |p| shape.at(&p.into()).distance).unwrap()
+    fn field(shape: &impl ObstacleShape, half: f64, cell: f64) -> DistanceGrid {
+        DistanceGrid::sample([[-half; 3], [half; 3]], cell, |p| shape.at(&p.into()).distance).unwrap()
     }
 
     /// The error falls with the square of the cell, and the normal is the gradient.
@@ -274,7 +274,7 @@ mod tests {
     #[test]
     fn numbers_that_are_no_distances_are_refused() {
         let field = |cell, counts: [usize; 3], value: fn(usize) -> f32| {
-            DistanceField::new([0.0; 3], cell, counts, (0..counts.iter().product()).map(value).collect())
+            DistanceGrid::new([0.0; 3], cell, counts, (0..counts.iter().product()).map(value).collect())
         };
         assert!(field(0.1, [4, 5, 6], |_| 0.3).is_ok());
         assert!(field(0.0, [4, 5, 6], |_| 0.3).is_err());
@@ -283,10 +283,10 @@ mod tests {
         assert!(field(0.1, [4, 5, 6], |i| if i == 7 { f32::NAN } else { 0.3 }).is_err());
         // A value that jumps.
         assert!(field(0.1, [4, 5, 6], |i| if i == 7 { 0.5 } else { 0.3 }).is_err());
-        assert!(DistanceField::new([0.0; 3], 0.1, [4, 4, 4], vec![0.0; 63]).is_err());
-        assert!(DistanceField::new([0.0; 3], 0.1, [usize::MAX, 4, 4], vec![0.0; 63]).is_err());
-        assert!(DistanceField::sample([[0.0; 3], [1.0; 3]], 1e-9, |_| 0.0).is_err());
-        assert!(DistanceField::sample([[0.0; 3], [1.0; 3]], -1.0, |_| 0.0).is_err());
-        assert!(DistanceField::sample([[0.0; 3], [1e300; 3]], 0.1, |_| 0.0).is_err());
+        assert!(DistanceGrid::new([0.0; 3], 0.1, [4, 4, 4], vec![0.0; 63]).is_err());
+        assert!(DistanceGrid::new([0.0; 3], 0.1, [usize::MAX, 4, 4], vec![0.0; 63]).is_err());
+        assert!(DistanceGrid::sample([[0.0; 3], [1.0; 3]], 1e-9, |_| 0.0).is_err());
+        assert!(DistanceGrid::sample([[0.0; 3], [1.0; 3]], -1.0, |_| 0.0).is_err());
+        assert!(DistanceGrid::sample([[0.0; 3], [1e300; 3]], 0.1, |_| 0.0).is_err());
     }
 }
