@@ -9,6 +9,9 @@ pub(crate) struct Pinned {
 
 impl Pinned {
     pub(crate) fn new() -> Self {
+        // The pool's threads start with its first use. Started later, all of them would stay here,
+        // and what is baked after that would have one core.
+        rayon::join(|| (), || ());
         #[cfg(target_os = "linux")]
         {
             use rustix::thread::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
