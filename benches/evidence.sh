@@ -55,6 +55,8 @@ for name in "${parts[@]}"; do
         stability) part stability "$program" stability -o docs/report/stability.md ;;
         peers)
             part peers python3 benches/peers/run.py --pliant "$program" -o docs/report/peers.md
+            part bounce python3 benches/peers/bounce.py --pliant "$program" \
+                -o docs/report/bounce.md
             ;;
         leave-out) part leave-out python3 benches/leave_out/run.py --one-engine ;;
         pictures) part pictures examples/pictures.sh ;;

@@ -584,3 +584,48 @@ fn what_a_scene_leaves_out_is_what_was_measured() {
     says(DECISIONS, "327 crates, a host without a picture", of("host", "crates"));
     says(DECISIONS, "216, and everything together", of("everything", "crates"));
 }
+
+#[test]
+fn a_ball_that_bounces_is_told_as_it_was_measured() {
+    let csv = read("docs/report/bounce.csv");
+    let mut lines = csv.lines();
+    let head: Vec<&str> = lines.next().unwrap().split(',').collect();
+    let cell = |row: &[String], name: &str| -> f64 {
+        row[head.iter().position(|column| *column == name).unwrap()].parse().unwrap()
+    };
+    // What ended otherwise says why in the last cell.
+    let rows: Vec<Vec<String>> =
+        lines.map(cells).filter(|row| row.last().is_some_and(String::is_empty)).collect();
+    let of = |ours: bool, least: f64, name: &str| -> Vec<f64> {
+        let some = rows.iter().filter(|row| row[0].starts_with("Pliant") == ours);
+        some.filter(|row| cell(row, "steps_a_second") >= least).map(|row| cell(row, name)).collect()
+    };
+    let page = read("docs/report/bounce.md");
+    let exact: Vec<f64> = row("docs/report/bounce.md", "| exact, by Hertz's law |")
+        .iter()
+        .filter_map(|cell| cell.parse().ok())
+        .collect();
+    let [time, force, _] = exact[..] else { panic!("{exact:?} in {page}") };
+    let shares = |ours| of(ours, 1000.0, "force_n").iter().map(|f| 100.0 * f / force).collect::<Vec<_>>();
+    says(DECISIONS, "touches the floor for 10.6 to 12 ms, where Hertz has", time);
+    says_range(
+        DECISIONS,
+        "At 1,000 steps a second and more it touches the floor for",
+        range(&of(true, 1e3, "contact_ms")),
+    );
+    says_range(DECISIONS, "ms, where Hertz has 11.51, with", range(&shares(true)));
+    let its_times = range(&of(false, 1e3, "contact_ms"));
+    says_range(DECISIONS, "Rapier, MuJoCo and PyBullet are within", its_times);
+    says_range(DECISIONS, "are within 10.5 to 15 ms and", range(&shares(false)));
+    let linear = |steps: f64| {
+        let row = rows.iter().find(|row| row[0] == "Pliant, linear" && cell(row, "steps_a_second") == steps);
+        cell(row.unwrap(), "height_percent")
+    };
+    for (before, steps) in [
+        ("comes back to", 240.0),
+        ("of its height at 240 steps a second, to", 1000.0),
+        ("at 1,000 and to", 16_000.0),
+    ] {
+        says("docs/contact.md", before, linear(steps));
+    }
+}
