@@ -31,12 +31,13 @@ impl DistanceField {
         Self(Arc::new(field))
     }
 
-    /// Samples the distance to the triangles of a mesh every `cell` (m). What is solid is what it
-    /// is for [`Obstacle::Mesh`](crate::Obstacle::Mesh).
+    /// Samples the distance to the triangles of a closed mesh every `cell` (m). What is solid is
+    /// what it is for [`Obstacle::Mesh`](crate::Obstacle::Mesh). A terrain is better sampled from
+    /// the function of its height.
     ///
     /// # Errors
-    /// Returns the error of a mesh that cannot be an obstacle, and of a cell that gives more than
-    /// 2^26 nodes.
+    /// Returns the error of a mesh that is open or cannot be an obstacle, and of a cell that gives
+    /// more than 2^26 nodes.
     #[cfg(feature = "mesh")]
     pub fn of_mesh(mesh: &Mesh, cell: f32) -> Result<Self, modal::StepError> {
         use bevy::math::DVec3;
@@ -44,6 +45,10 @@ impl DistanceField {
 
         let source = crate::mesh::Source::new(mesh, false)?;
         let solid = crate::mesh::Solid::new(&source, DVec3::ONE)?;
+        if !solid.closed {
+            let (what, expected) = ("mesh of a distance field", "triangles that enclose a solid");
+            return Err(modal::StepError::Input { what, expected, got: f64::NAN });
+        }
         let corners = source.positions.iter().map(|p| Vec3::from(*p).as_dvec3());
         let bounds =
             corners.fold([DVec3::INFINITY, DVec3::NEG_INFINITY], |[low, high], p| [low.min(p), high.max(p)]);

@@ -25,6 +25,8 @@ use crate::obstacle::FAR;
 #[derive(Debug)]
 pub(crate) struct Solid {
     triangles: TriMesh,
+    /// Whether the triangles enclose what is solid.
+    pub(crate) closed: bool,
     /// Distance below which the direction to the closest point is rounding error, m.
     tiny: f64,
 }
@@ -71,7 +73,8 @@ impl Solid {
         }
         // A closed mesh may have been made inside out, and a mirrored one is.
         let (volume, size) = (volume(&points, &triangles), size(&points));
-        if is_closed(&triangles) {
+        let closed = is_closed(&triangles);
+        if closed {
             if volume < 0.0 {
                 triangles.iter_mut().for_each(|t| t.swap(1, 2));
             }
@@ -86,7 +89,7 @@ impl Solid {
                 expected: "edges that at most two of them share, in opposite directions",
                 got: count as f64,
             })?;
-        Ok(Self { triangles, tiny: 1e-12 * size })
+        Ok(Self { triangles, closed, tiny: 1e-12 * size })
     }
 }
 

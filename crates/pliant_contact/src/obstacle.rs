@@ -55,7 +55,8 @@ pub enum Obstacle {
     /// nothing until the mesh is loaded, and a mesh that is only in the render world is refused.
     #[cfg(feature = "mesh")]
     Mesh(Handle<Mesh>),
-    /// A signed distance field. It touches nothing until the asset is there.
+    /// A signed distance field, which an entity with a negative scale does not mirror. It touches
+    /// nothing until the asset is there.
     Field(Handle<DistanceField>),
 }
 

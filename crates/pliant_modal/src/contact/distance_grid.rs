@@ -12,6 +12,24 @@ const MOST: usize = 1 << 26;
 /// for single precision, and for a distance that is itself interpolated.
 const SLACK: f64 = 0.01;
 
+/// The thirteen directions to the nodes of the cells around a node, one of each pair of opposite
+/// ones.
+const NEIGHBORS: [[isize; 3]; 13] = [
+    [1, 0, 0],
+    [0, 1, 0],
+    [0, 0, 1],
+    [1, 1, 0],
+    [1, -1, 0],
+    [1, 0, 1],
+    [1, 0, -1],
+    [0, 1, 1],
+    [0, 1, -1],
+    [1, 1, 1],
+    [1, 1, -1],
+    [1, -1, 1],
+    [1, -1, -1],
+];
+
 /// A solid of any shape, given by its signed distance at the nodes of a grid. A query takes the
 /// same time whatever the shape is.
 ///
@@ -21,14 +39,17 @@ const SLACK: f64 = 0.01;
 /// of radius `R`. What is thinner than two cells may be missing.
 ///
 /// The outermost layer of cells only serves those within it. Beyond these, the distance is a lower
-/// bound if the grid's edge is outside the solid. Where the solid reaches that edge, it goes on
-/// without end.
+/// bound if the solid reaches none of the two outermost layers of nodes. Otherwise it goes on
+/// without end, as the surface does at the nearest place of the inner cells: a terrain ends in
+/// slopes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DistanceGrid {
     origin: Vector3<f64>,
     cell: f64,
     counts: [usize; 3],
     values: Vec<f32>,
+    /// Whether the solid reaches the two outermost layers of nodes.
+    open: bool,
 }
 
 impl DistanceGrid {
@@ -38,8 +59,8 @@ impl DistanceGrid {
     /// # Errors
     /// Returns [`StepError::Input`] if a number is not finite, the cell is not above zero, there
     /// are fewer than four nodes along an axis or another number of values, or if two neighbors
-    /// differ by more than their distance: no solid has such distances, and a body that is fast
-    /// could pass through.
+    /// differ by more than their distance, also across a cell: no solid has such distances, and a
+    /// body that is fast could pass through.
     pub fn new(origin: [f64; 3], cell: f64, counts: [usize; 3], values: Vec<f32>) -> Result<Self, StepError> {
         finite("origin of a distance grid", &origin)?;
         let sound = cell > 0.0 && cell.is_finite();
@@ -62,10 +83,16 @@ impl DistanceGrid {
             bad.is_none(),
             bad.unwrap_or(0.0).into(),
         )?;
-        let field = Self { origin: origin.into(), cell, counts, values };
+        let mut field = Self { origin: origin.into(), cell, counts, values, open: false };
         let steepest = field.steepest();
         let expected = "neighbors that differ by their distance at most";
         StepError::check("slope of a distance grid", expected, steepest <= 1.0 + SLACK, steepest)?;
+        let outer = |axis: usize, node: usize| node < 2 || node + 2 >= counts[axis];
+        let mut nodes = field.values.iter().enumerate();
+        field.open = nodes.any(|(at, value)| {
+            let node = [at % counts[0], at / counts[0] % counts[1], at / (counts[0] * counts[1])];
+            *value <= 0.0 && (0..3).any(|axis| outer(axis, node[axis]))
+        });
         Ok(field)
     }
 
@@ -110,22 +137,20 @@ impl DistanceGrid {
         self.cell
     }
 
-    /// The largest difference of two neighbors as a share of their distance.
+    /// The largest difference of two nodes of a cell, as a share of their distance.
     fn steepest(&self) -> f64 {
-        let strides = [1, self.counts[0], self.counts[0] * self.counts[1]];
+        let [nx, ny, _] = self.counts;
         let mut steepest = 0.0f64;
-        for (axis, stride) in strides.into_iter().enumerate() {
-            for (at, [a, b]) in self
-                .values
-                .iter()
-                .zip(self.values.iter().skip(stride))
-                .enumerate()
-                .map(|(at, (a, b))| (at, [*a, *b]))
-            {
-                // The last node of a row has no neighbor in it.
-                if at / stride % self.counts[axis] + 1 < self.counts[axis] {
-                    steepest = steepest.max(f64::from(b - a).abs());
-                }
+        for (at, value) in self.values.iter().enumerate() {
+            let node = [at % nx, at / nx % ny, at / (nx * ny)];
+            for step in NEIGHBORS {
+                let other: [Option<usize>; 3] = std::array::from_fn(|k| {
+                    node[k].checked_add_signed(step[k]).filter(|n| *n < self.counts[k])
+                });
+                let [Some(x), Some(y), Some(z)] = other else { continue };
+                let apart = step.iter().map(|k| (k * k) as f64).sum::<f64>().sqrt();
+                let other = self.values[x + nx * (y + ny * z)];
+                steepest = steepest.max(f64::from(other - value).abs() / apart);
             }
         }
         steepest / self.cell
@@ -179,8 +204,8 @@ impl ObstacleShape for DistanceGrid {
         if beyond == Vector3::zeros() {
             return SurfacePoint { distance, normal };
         }
-        if distance <= 0.0 {
-            return SurfacePoint { distance: distance - beyond.norm(), normal };
+        if self.open {
+            return SurfacePoint { distance: distance + normal.dot(&beyond), normal };
         }
         // The solid lies within the grid, a convex box: whatever is `distance` from the box's
         // nearest point is at least the hypotenuse from here.
@@ -239,8 +264,25 @@ mod tests {
             assert!((found.distance - exact.distance).abs() < 1e-6, "{point}");
             assert!((found.normal - exact.normal).norm() < 1e-5, "{point}");
         }
-        assert!(field.at(&Vector3::new(0.0, -50.0, 0.0)).distance < -49.0);
-        assert!(field.at(&Vector3::new(0.0, 50.0, 0.0)).distance > 49.0);
+        // Beyond the grid in every direction, too, without a jump.
+        for point in points(30.0) {
+            let (found, exact) = (field.at(&point), plane.at(&point));
+            assert!((found.distance - exact.distance).abs() < 1e-3, "{point}: {}", found.distance);
+        }
+    }
+
+    /// What slides off a terrain comes to a slope, and not to a step.
+    #[test]
+    fn a_terrain_has_no_jump_at_its_edge() {
+        let hill = |p: [f64; 3]| (p[1] - 0.1 * (3.0 * p[0]).sin() * (2.0 * p[2]).cos()) / 1.1;
+        let field = DistanceGrid::sample([[-0.5; 3], [0.5; 3]], 0.05, hill).unwrap();
+        for i in 1..2000 {
+            let at = |k: f64| 0.9 * (f64::from(i) * k).sin();
+            // The inner cells end at 0.6.
+            let point = Vector3::new(0.6 * at(0.3).signum(), at(1.3), at(2.1));
+            let [inner, outer] = [-1e-6, 1e-6].map(|way| field.at(&(point * (1.0 + way))).distance);
+            assert!((inner - outer).abs() < 1e-5, "{point}: {inner} and {outer}");
+        }
     }
 
     /// A body that is far away and fast must not be told that it is farther than it is.
@@ -283,6 +325,9 @@ mod tests {
         assert!(field(0.1, [4, 5, 6], |i| if i == 7 { f32::NAN } else { 0.3 }).is_err());
         // A value that jumps.
         assert!(field(0.1, [4, 5, 6], |i| if i == 7 { 0.5 } else { 0.3 }).is_err());
+        // Along the axes its slope is one, and across the cells more.
+        let taxi = |p: [f64; 3]| p.iter().map(|x| x.abs()).sum::<f64>() - 0.3;
+        assert!(DistanceGrid::sample([[-0.5; 3], [0.5; 3]], 0.1, taxi).is_err());
         assert!(DistanceGrid::new([0.0; 3], 0.1, [4, 4, 4], vec![0.0; 63]).is_err());
         assert!(DistanceGrid::new([0.0; 3], 0.1, [usize::MAX, 4, 4], vec![0.0; 63]).is_err());
         assert!(DistanceGrid::sample([[0.0; 3], [1.0; 3]], 1e-9, |_| 0.0).is_err());
