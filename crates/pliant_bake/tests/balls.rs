@@ -32,6 +32,8 @@ fn a_sliding_ball_ends_rolling_at_five_sevenths_of_its_speed() {
     }
 }
 
+/// Two spheres touch as one with the radius `r R / (r + R)` touches a plane, whatever the direction
+/// in which the body is turned.
 #[test]
 fn a_ball_touches_a_ball_for_the_time_of_hertz_however_it_is_turned() {
     let (young, radius, speed, steps) = (1e6, 0.1f64, 0.2f64, 64.0);
@@ -67,6 +69,8 @@ fn a_ball_touches_a_ball_for_the_time_of_hertz_however_it_is_turned() {
     }
 }
 
+/// A ball that spins about the normal rubs with the torque of the pressure of Hertz,
+/// `3 pi / 16 mu F a` (K. L. Johnson, *Contact Mechanics*, 1985), until it rests.
 #[test]
 fn a_ball_that_spins_on_the_spot_comes_to_rest_as_friction_says() {
     let (young, radius, friction) = (1e6, 0.1f64, 0.4);

@@ -123,10 +123,6 @@ fn on_an_incline_a_cube_sticks_or_slides_as_coulomb_says() {
     }
 }
 
-/// Two spheres touch as one with the radius `r R / (r + R)` touches a plane, whatever the direction
-/// in which the body is turned.
-/// A ball that spins about the normal rubs with the torque of the pressure of Hertz,
-/// `3 pi / 16 mu F a` (K. L. Johnson, *Contact Mechanics*, 1985), until it rests.
 #[test]
 fn a_block_topples_when_its_height_says_so() {
     let model = model(&shapes::bar([3, 9, 3], [0.1, 0.3, 0.1]).unwrap(), 1e7, |_| ());

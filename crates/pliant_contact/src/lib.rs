@@ -63,8 +63,8 @@ pub use obstacle::{ContactLayers, Obstacle};
 
 /// Lets bodies touch the [`Obstacle`]s of the scene, and each other ([`TouchBodies`]).
 ///
-/// The plugin needs [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin) in the same schedule, and is
-/// added after Bevy's `AssetPlugin`, which `DefaultPlugins` has.
+/// The plugin needs [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin) in the same schedule, and
+/// is added after Bevy's `AssetPlugin`, which `DefaultPlugins` has.
 pub struct ContactPlugin {
     schedule: InternedScheduleLabel,
 }

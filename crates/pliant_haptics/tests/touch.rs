@@ -200,6 +200,8 @@ fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
                 assert!(world.given <= 5e-3, "{name}: {}", world.given);
                 assert!(pulled >= -1e-3, "{name}: {pulled}");
                 assert!(world.jump <= slew(&world) * 1.000_001, "{name}: {}", world.jump);
+                // The slew limit alone would let a kick of any size through as a ramp.
+                assert!(world.wish < 0.75 * most, "{name}: {} of {most}", world.wish);
                 // Over the closed way the hand has paid.
                 assert!(world.cycle.device().work() <= 1e-6, "{name}: {}", world.cycle.device().work());
             }
@@ -245,6 +247,7 @@ fn a_touch_at_half_a_meter_a_second_is_no_kick() {
             world.wish
         );
         assert!(world.jump > 0.0 && world.jump <= slew(&world) * 1.000_001);
+        assert!(world.wish < 0.5, "{young:?}: {}", world.wish);
     }
 }
 

@@ -245,8 +245,8 @@ fn squeezed(elasticity: Elasticity, rate: f64) -> Result<CaseOutcome, LabError> 
         fastest = fastest.max((2.0 * body.kinetic_energy() / model.mass()).sqrt());
     }
     let away = (Vector3::from(body.frame().center()) - Vector3::from(model.center_of_mass())).norm();
-    // A penetration is taken back at half the size a second, which is 0.01 here. A reduced body
-    // that steps as seldom as this snaps once.
+    // A penetration is taken back at half the size a second, which is 0.01 here; the mean over the
+    // body is less. A reduced body that steps as seldom as this snaps once.
     let most = if elasticity == Elasticity::Reduced && rate < 100.0 { 0.03 } else { 0.008 };
     Ok(CaseOutcome::of(vec![
         Bound::new("fastest rms speed / speed of sound", fastest / sound, most),
