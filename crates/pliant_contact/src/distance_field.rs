@@ -22,7 +22,9 @@ use pliant_modal as modal;
 /// let field = DistanceField::new(field);
 /// # Ok::<(), modal::StepError>(())
 /// ```
-#[derive(Asset, TypePath, Debug, Clone)]
+#[derive(Asset, Reflect, Debug, Clone)]
+#[reflect(opaque)]
+#[reflect(Debug, Clone)]
 pub struct DistanceField(Arc<modal::DistanceGrid>);
 
 impl DistanceField {

@@ -90,6 +90,7 @@ impl Plugin for ContactPlugin {
         #[cfg(feature = "avian")]
         avian::build(app, self.schedule);
         app.init_asset::<DistanceField>()
+            .register_asset_reflect::<DistanceField>()
             .register_type::<Obstacle>()
             .register_type::<ContactLayers>()
             .register_type::<BodyFriction>()
