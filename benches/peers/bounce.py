@@ -190,7 +190,7 @@ def bullet(pliant, folder, cells, rate):
 
 
 def jobs(pliant, folder, quick):
-    """Program, size, and the work."""
+    """Program, cells across, steps a second, and the work."""
     fresh = lambda: pathlib.Path(tempfile.mkdtemp(dir=folder))
     every = []
     for cells in (6,) if quick else (6, 10):
@@ -198,21 +198,21 @@ def jobs(pliant, folder, quick):
             for rate in (240, 1000, 4000, 16_000):
                 for element in ("tet10", "tet4") if rate == 1000 else ("tet10",):
                     name = f"Pliant, {elasticity}" + (", four nodes" if element == "tet4" else "")
-                    every.append((name, lambda c=cells, e=element, k=elasticity, r=rate: ours(pliant, fresh(), c, e, k, r)))
+                    every.append((name, cells, rate, lambda c=cells, e=element, k=elasticity, r=rate: ours(pliant, fresh(), c, e, k, r)))
         # The finer mesh takes them minutes.
         for rate in (1000, 4000) if cells == 6 else (1000,):
-            every.append(("Rapier, constraints", lambda c=cells, r=rate: rapier(pliant, fresh(), c, "CONSTRAINTS", "COROTATIONAL", r)))
-            every.append(("Rapier, neo-Hookean", lambda c=cells, r=rate: rapier(pliant, fresh(), c, "FEM", "NEO_HOOKEAN", r)))
-            every.append(("MuJoCo flex", lambda c=cells, r=rate: mujoco_flex(pliant, fresh(), c, r)))
+            every.append(("Rapier, constraints", cells, rate, lambda c=cells, r=rate: rapier(pliant, fresh(), c, "CONSTRAINTS", "COROTATIONAL", r)))
+            every.append(("Rapier, neo-Hookean", cells, rate, lambda c=cells, r=rate: rapier(pliant, fresh(), c, "FEM", "NEO_HOOKEAN", r)))
+            every.append(("MuJoCo flex", cells, rate, lambda c=cells, r=rate: mujoco_flex(pliant, fresh(), c, r)))
         for rate in (4000, 16_000):
-            every.append(("PyBullet, neo-Hookean", lambda c=cells, r=rate: bullet(pliant, fresh(), c, r)))
+            every.append(("PyBullet, neo-Hookean", cells, rate, lambda c=cells, r=rate: bullet(pliant, fresh(), c, r)))
     return every
 
 
 def measure(pliant, folder, quick):
     rows = []
-    for program, work in jobs(pliant, folder, quick):
-        row = {"program": program, "tetrahedra": "", "steps_a_second": "", "contact_ms": "", "force_n": "", "height_percent": "", "ms_a_second": "", "why": ""}
+    for program, cells, rate, work in jobs(pliant, folder, quick):
+        row = {"program": program, "tetrahedra": 6 * cells**3, "steps_a_second": rate, "contact_ms": "", "force_n": "", "height_percent": "", "ms_a_second": "", "why": ""}
         try:
             tets, step, heights, cost, *mass = within(LIMIT, work, folder)
             row |= {"tetrahedra": tets, "steps_a_second": round(1 / step)} | bounce(step, heights, *mass) | {"ms_a_second": cost}
