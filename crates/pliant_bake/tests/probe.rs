@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::Vector3;
-use pliant_bake::{BakeConfig, bake};
+use pliant_bake::{BakeConfig, DeadLoad, StaticLoads, bake, deflect};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
     Body, BodyConfig, Damping, Islands, ModalModel, Patch, Plane, Probe, ProbeConfig, StepSettings, Together,
@@ -137,6 +137,54 @@ fn a_pressed_block_gives_the_force_of_the_full_solution() {
             let sum = force(&probes[0]) + Vector3::from(contacts.report().force);
             assert!(sum.norm() < 1e-12 * got, "{sum}");
         }
+    }
+}
+
+/// Deep presses, with reduced elasticity, against nonlinear finite elements of the same material
+/// under the same force on the same patch.
+#[test]
+fn a_deeply_pressed_block_gives_the_force_of_the_full_nonlinear_solution() {
+    let mesh = shapes::cube(6, 0.1).unwrap();
+    let anchors = vec!["y<0.001".parse().unwrap()];
+    let damping = Damping::Ratio(0.3);
+    let config = BakeConfig { young: 1e5, poisson: 0.3, anchors, damping, ..BakeConfig::default() };
+    let model = Arc::new(bake(&mesh, None, &config, &mut |_, _| {}).unwrap().model);
+    let material = config.material.unwrap();
+    let (at, stiffness) = (top(&model), 5e3);
+    let mut bodies = [body(&model, 60.0)];
+    let press = ProbeConfig { radius: 0.01, stiffness, relaxation: 2e-3, friction: 0.5 };
+    let mut probes = [Probe::new(press, (at + Vector3::new(0.0, 0.011, 0.0)).into()).unwrap()];
+    let mut islands = Islands::default();
+    for depth in [0.004, 0.008, 0.016] {
+        let from = probes[0].target()[1];
+        let to = at.y + 0.01 - depth;
+        for k in 0..600 {
+            let share = (f64::from(k) / 300.0).min(1.0);
+            probes[0].set_target([at.x, from + share * (to - from), at.z]).unwrap();
+            step(&mut islands, &mut bodies, &mut probes, 60.0);
+        }
+        let contacts = bodies[0].contacts();
+        let [contact] = contacts.contacts() else { panic!("{} contacts", contacts.contacts().len()) };
+        let spacing = (0.05_f64 / contacts.sites() as f64).sqrt();
+        let (got, sunk) = (force(&probes[0]).y, at.y + 0.01 - probes[0].position()[1]);
+        // Force against way of the full solution, near the force that the probe feels.
+        let full = |force: f64| {
+            let patch = Patch::around(model.surface(), contact.vertex, spacing).unwrap();
+            let load = [DeadLoad { patch, force: [0.0, -force, 0.0] }];
+            let loads = StaticLoads { forces: &load, ..StaticLoads::default() };
+            -deflect(&mesh, &config, material, &loads).unwrap().patches[0][1]
+        };
+        let [(near, y), (far, z)] = [got, 1.1 * got].map(|force| (full(force), force));
+        let want = y * (sunk / near).powf((z / y).ln() / (far / near).ln());
+        println!(
+            "{:.1} mm deep ({:.0} %): {got:.3} N, full nonlinear {want:.3} N ({:+.1} %)",
+            1e3 * sunk,
+            1e3 * sunk,
+            100.0 * (got / want - 1.0)
+        );
+        // The dent itself is linear, and at a seventh of the height it should not be.
+        let bound = if depth < 0.01 { 0.05 } else { 0.09 };
+        assert!((got / want - 1.0).abs() < bound, "{got} {want}");
     }
 }
 

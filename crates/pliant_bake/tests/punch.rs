@@ -91,3 +91,36 @@ fn a_flat_punch_is_as_stiff_as_the_full_solution_says() {
         }
     }
 }
+
+/// I. N. Sneddon, *The relation between load and penetration in the axisymmetric Boussinesq problem
+/// for a punch of arbitrary profile* (1965): a punch without friction has the force `2 E* a d`.
+#[test]
+fn a_punch_without_friction_is_as_stiff_as_a_half_space_says() {
+    let (young, poisson, size) = (1e5, 0.3f64, 0.2);
+    let cell = size / 8.0;
+    // The base, which is held, makes up for the sides, which are free: the full solution of a punch
+    // that sticks is 0.99 of its formula on this block.
+    let mesh = shapes::bar([8, 4, 8], [size, 0.5 * size, size]).unwrap();
+    let anchor: Anchor = "y<1e-6".parse().unwrap();
+    for modes in [30, 100] {
+        let anchors = vec![anchor];
+        let config = BakeConfig { modes, young, poisson, anchors, ..BakeConfig::linear() };
+        let model = Arc::new(bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model);
+        let (center, radius, depth) = ([0.5 * size; 2], 2.3 * cell, 1e-4 * size);
+        let settings = StepSettings { damping_scale: 20.0, ..StepSettings::default() };
+        let mut body = Body::new(model.clone(), settings.into()).unwrap();
+        body.set_friction(0.0).unwrap();
+        body.set_obstacles(vec![Arc::new(Punch { center, radius, height: 0.5 * size - depth })]).unwrap();
+        for _ in 0..1200 {
+            body.step().unwrap();
+        }
+        let got = -body.contacts().report().force[1];
+        let places = body.contacts().report().contacts;
+        // The circle of the area that the touching sites stand for.
+        let wide = (places as f64 * cell * cell / std::f64::consts::PI).sqrt();
+        let want = 2.0 * young / (1.0 - poisson * poisson) * wide * depth;
+        println!("{modes} modes: {places} places, {:.3} of a half-space", got / want);
+        assert_eq!(places, 21);
+        assert!((got / want - 1.0).abs() < 0.05, "{modes}: {got} {want}");
+    }
+}
