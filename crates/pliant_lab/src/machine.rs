@@ -84,7 +84,9 @@ fn commit() -> String {
 /// Returns whether a short status of git has a file of Rust or of Cargo.
 fn has_code(status: &str) -> bool {
     let mut paths = status.lines().flat_map(|line| line.split(" -> "));
-    paths.any(|path| [".rs", ".toml"].iter().any(|kind| path.trim_end_matches('"').ends_with(*kind)))
+    paths.any(|path| {
+        [".rs", ".toml", "Cargo.lock"].iter().any(|kind| path.trim_end_matches('"').ends_with(*kind))
+    })
 }
 
 /// A line that says when, in which time, by which command, from which commit and on which machine
@@ -157,6 +159,7 @@ mod tests {
     fn a_changed_program_is_told_from_a_changed_page() {
         assert!(super::has_code(" M docs/report/report.md\n M crates/pliant_lab/src/lib.rs\n"));
         assert!(super::has_code("M  Cargo.toml\n"));
+        assert!(super::has_code(" M Cargo.lock\n"));
         assert!(super::has_code("R  a.rs -> b.txt\n"));
         assert!(super::has_code(" M \"crates/\\303\\244.rs\"\n"));
         assert!(!super::has_code(" M docs/report/report.md\n M docs/report/a-bar-pull.csv\n"));

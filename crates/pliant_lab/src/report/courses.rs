@@ -26,7 +26,7 @@ const LATE: u16 = 50;
 const DRAWN: f64 = 150.0;
 
 /// What is alike in all of these figures, and what the default has and the paper's ways do not.
-const ALIKE: &str = "The body has linear elasticity, and the hands have no tremor. The paper's ways have no repeats and no playout delay here, as in the paper. The default repeats each tick in the next three frames and shows it one tick later. A tick that is lost alone therefore arrives in time, so that at the 22 losses at random the default shows what it shows without loss.";
+const ALIKE: &str = "The body has linear elasticity, and the hands have no tremor. The paper's ways have no repeats and no playout delay here, as in the paper. The default repeats each tick in the next three frames and shows it one tick later. A tick that is lost alone therefore arrives in time.";
 
 /// A figure of the paper: its number, its title and its lines.
 struct Course {

@@ -460,7 +460,7 @@ fn over_network(quick: bool, progress: &mut dyn Progress) -> Result<(Figure, Str
         series,
         None,
         format!(
-            "A bar of 8 x 2 x 2 cells has 60 modes and two hands at the host, at 40 Hz. The figure shows every recovery policy with coarser and finer frames (quanta of 2^-4 to 2^-18 of the deformation, default 2^-14). As in part f, all have a playout delay of {delay} tick and {repeats} repeats. Streams of accelerations have the paper's integrator at both ends. `none` is not drawn, because its errors never decay."
+            "A bar of 8 x 2 x 2 cells has 60 modes and two hands at the host, at 40 Hz. The figure shows every recovery policy with coarser and finer frames (quanta of 2^-4 to 2^-18 of the deformation, default 2^-14). As in part f, all have a playout delay of {delay} tick and {repeats} repeats. Streams of accelerations have the paper's integrator at both ends. `none` is not drawn, because its errors never decay, and `paper-repeats` is not drawn, because with these repeats it is `paper`."
         ),
     );
     Ok((made, text))

@@ -239,7 +239,8 @@ fn drag(young: f64, hand: HandModel, simulation: f64, round_trip: f64) -> Result
 
 /// Pulls a device without friction 2 mm to the side, so that the loop alone calms it. What the
 /// spring of the arm feels along the pull is then the force of the coupling in series with the full
-/// finite elements.
+/// finite elements. Across it, a soft bar that is held in all directions also pulls by what its
+/// bending shortens it (a quarter to a third of the force at 1e5 Pa), which no linear solution has.
 fn hold(young: f64, hand: HandModel, round_trip: f64) -> Result<CaseOutcome, LabError> {
     let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
     let mut scene = DeviceScene::new(device, young, hand, STEPS, round_trip)?;
