@@ -1,6 +1,7 @@
 //! The report on the method's cost and errors, measured on this machine: tables, CSV, SVG, PNG and
 //! text.
 
+mod contact;
 mod courses;
 mod elasticity;
 mod frames;
@@ -44,6 +45,8 @@ pub enum Part {
     Front,
     /// Linear and reduced elasticity, by error and run time.
     Elasticity,
+    /// Contacts with known answers.
+    Contact,
     /// The paper's table 2.
     Table2,
     /// The paper's table 2 with compensation and without.
@@ -58,7 +61,7 @@ pub enum Part {
 
 impl Part {
     /// All parts, in the order of the report.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Elements,
         Self::Modes,
         Self::Steps,
@@ -68,6 +71,7 @@ impl Part {
         Self::Network,
         Self::Front,
         Self::Elasticity,
+        Self::Contact,
         Self::Table2,
         Self::Table2Repair,
         Self::Table3,
@@ -87,6 +91,7 @@ impl Part {
             Self::Network => "network",
             Self::Front => "front",
             Self::Elasticity => "elasticity",
+            Self::Contact => "contact",
             Self::Table2 => "table-2",
             Self::Table2Repair => "table-2-repair",
             Self::Table3 => "table-3",
@@ -111,6 +116,7 @@ impl Part {
             Self::Network => "f. Network",
             Self::Front => "g. All together",
             Self::Elasticity => "h. Elasticity",
+            Self::Contact => "i. Contact",
             Self::Table2 => "The paper's table 2",
             Self::Table2Repair => "The paper's table 2 with compensation",
             Self::Table3 => "The paper's networks and what crosses them (its table 3)",
@@ -267,6 +273,7 @@ fn measure(
         Part::Network => networks::networks(quick, progress)?,
         Part::Front => front::all_together(quick, progress)?,
         Part::Elasticity => elasticity::elasticity(quick)?,
+        Part::Contact => contact::contact(quick)?,
         Part::Table2 => {
             let size = if quick { (0.05, 40) } else { (2.0, 1) };
             (Vec::new(), tables::table_2(models, own, size, progress)?)
