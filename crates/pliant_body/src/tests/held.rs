@@ -13,6 +13,10 @@ use pliant_modal::{Elasticity, HeldPlace, ModalModel};
 use super::{app, refusals, spawn_with, state, steps};
 use crate::{Grab, GrabForce, GrabOf, HeldShapesCache, ModalBody, VisualState};
 
+/// Time after which shapes are not made any more. How long they take is told by a bench: on a busy
+/// machine two minutes were not enough for twenty sets.
+const HANGS: Duration = Duration::from_secs(900);
+
 /// A bar of 1 m by 0.1 m by 0.1 m along x, clamped at x = 0.
 fn bar() -> ModalModel {
     let config = BakeConfig {
@@ -41,7 +45,7 @@ fn has_shapes(app: &App, body: Entity) -> bool {
 fn wait_for_shapes(app: &mut App, body: Entity) {
     let begun = Instant::now();
     while !has_shapes(app, body) {
-        assert!(begun.elapsed() < Duration::from_secs(120), "no shapes are made");
+        assert!(begun.elapsed() < HANGS, "no shapes are made");
         std::thread::sleep(Duration::from_millis(2));
         app.update();
     }
@@ -71,7 +75,7 @@ fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
     for _ in 0..20 {
         steps(&mut app, 20);
         while app.world().resource::<HeldShapesCache>().is_making() {
-            assert!(begun.elapsed() < Duration::from_secs(120));
+            assert!(begun.elapsed() < HANGS);
             std::thread::sleep(Duration::from_millis(2));
             steps(&mut app, 1);
         }
@@ -119,7 +123,7 @@ fn a_hand_that_does_not_stand_still_gets_new_shapes_on_its_way() {
     wait_for_shapes(&mut app, body);
     let (begun, mut turn, mut farthest) = (Instant::now(), 0.0f64, 0.0f64);
     while farthest < 0.05 {
-        assert!(begun.elapsed() < Duration::from_secs(120), "the shapes stay those at rest");
+        assert!(begun.elapsed() < HANGS, "the shapes stay those at rest");
         turn += 0.01;
         let to = rest + DVec3::new(0.0, 0.15 * turn.sin(), 0.1 * (0.7 * turn).sin());
         app.world_mut().get_mut::<Grab>(hand).unwrap().target = to;
