@@ -44,6 +44,7 @@
 //! - `gamepad` (includes `plugin`): gamepads as position sources.
 //! - `rumble` (includes `gamepad`): vibration of gamepads.
 //! - `render` (includes `plugin`): draws the force as an arrow.
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

@@ -51,6 +51,7 @@
 //! that it does not.
 //!
 //! [`transport`] is the layer below. It knows neither bodies nor Bevy.
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

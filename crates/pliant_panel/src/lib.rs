@@ -27,6 +27,7 @@
 //! `net`, `haptics`: the sections for the session and the devices. `contact`: what each body
 //! touches, and with which force. The section for a recording appears with the resource
 //! [`PanelRecording`], which `pliant` keeps for the rerun viewer.
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

@@ -46,6 +46,7 @@
 //! whose rate in [`RerunRecording`] is zero is not gathered. A missing or closed viewer is not an
 //! error, and then costs nothing. The recording is complete after [`AppExit`](bevy::app::AppExit),
 //! when the app is dropped, and when a panic unwinds it.
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
