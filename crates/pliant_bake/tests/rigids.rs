@@ -25,10 +25,10 @@ fn cube(young: f64) -> Arc<ModalModel> {
 
 /// A box that a simple engine moves: it applies what a step tells, as the step expects.
 #[derive(Debug, Clone)]
-struct Crate {
+pub(crate) struct Crate {
     half: Vector3<f64>,
     mass: f64,
-    center: Vector3<f64>,
+    pub(crate) center: Vector3<f64>,
     turn: UnitQuaternion<f64>,
     velocity: Vector3<f64>,
     spin: Vector3<f64>,
@@ -38,7 +38,7 @@ struct Crate {
 #[derive(Debug)]
 struct Shape(Moving<Cuboid>);
 
-const KEY: [u64; 2] = [7, 0];
+pub(crate) const KEY: [u64; 2] = [7, 0];
 
 impl ObstacleShape for Shape {
     fn at(&self, point: &Vector3<f64>) -> SurfacePoint {
@@ -59,7 +59,7 @@ impl ObstacleShape for Shape {
 }
 
 impl Crate {
-    fn new(half: [f64; 3], mass: f64, center: [f64; 3]) -> Self {
+    pub(crate) fn new(half: [f64; 3], mass: f64, center: [f64; 3]) -> Self {
         let (velocity, spin) = (Vector3::zeros(), Vector3::zeros());
         let turn = UnitQuaternion::identity();
         Self { half: half.into(), mass, center: center.into(), turn, velocity, spin }
@@ -104,7 +104,7 @@ impl Crate {
         }))
     }
 
-    fn rigid(&self, ground: bool, forces: &[f64]) -> Rigid {
+    pub(crate) fn rigid(&self, ground: bool, forces: &[f64]) -> Rigid {
         let inverse = self.inverse_inertia();
         let mut supports = Vec::new();
         for corner in 0..8 {
@@ -137,7 +137,7 @@ impl Crate {
         }
     }
 
-    fn advance(&mut self, told: &Rigid, h: f64) {
+    pub(crate) fn advance(&mut self, told: &Rigid, h: f64) {
         if told.force == [0.0; 3] && !told.supports.is_empty() {
             // The step says nothing of what only stands on the floor.
             return;

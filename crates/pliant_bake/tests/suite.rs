@@ -2,6 +2,7 @@
 //!
 //! One program, since linking one for each of these files would take longer than their tests.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+mod attached;
 mod bake;
 mod balls;
 mod contact;

@@ -1,5 +1,6 @@
 //! A moving body: its state, its grabs and the forces on it.
 
+mod attachments;
 mod grabs;
 
 use std::sync::Arc;
@@ -241,7 +242,8 @@ impl Body {
     /// Returns an error if a number is not finite or the quaternion has length zero.
     pub fn set_pose(&mut self, position: [f64; 3], rotation: [f64; 4]) -> Result<(), StepError> {
         self.state.frame.set_pose(self.kernel.model(), position, rotation)?;
-        self.contacts.forget();
+        // An anchored body on something that moves is posed anew at every step.
+        self.contacts.begin_anew();
         Ok(())
     }
 
@@ -258,8 +260,9 @@ impl Body {
         if prepared { Ok(()) } else { self.kernel.prepare_contacts(&mut self.contacts) }
     }
 
-    /// Sets the coefficient of friction between the body and all obstacles, 0 to
-    /// [`Contacts::MAX_FRICTION`]. Default: [`Contacts::FRICTION`].
+    /// Sets the body's coefficient of friction, 0 to [`Contacts::MAX_FRICTION`]. It counts at
+    /// obstacles that have none of their own, and at others the geometric mean of both. Default:
+    /// [`Contacts::FRICTION`].
     ///
     /// # Errors
     /// Returns [`StepError::Input`] for another number. The old one then stays.

@@ -138,6 +138,9 @@ pub enum StepError {
     /// The grab does not exist on this body, or was released.
     #[error("no such grab on this body")]
     NoGrab,
+    /// The attachment does not exist on this body, or has ended.
+    #[error("no such attachment on this body")]
+    NoAttachment,
     /// The shapes of held patches were made for another model.
     #[error("the shapes of held patches are those of another model")]
     OtherModel,

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::{
-    Body, Probe, Rigid, StepError, StepReport,
+    AttachedTo, Body, Probe, Rigid, StepError, StepReport,
     contact::{Sixes, Touched, Touching},
     step::group::{self, Member, Others, Parts, View},
 };
@@ -326,8 +326,8 @@ impl Islands {
         }
     }
 
-    /// Finds the bodies near each rigid body that gives way. A resting one must touch it or be
-    /// about to, so that what moves beside it does not wake it.
+    /// Finds the bodies that are attached to each rigid body that gives way, or near it. A resting
+    /// one must touch it or be about to, so that what moves beside it does not wake it.
     fn find_pushed(&mut self, bodies: &[Together<'_>], h: f64) {
         for rigid in &mut self.rigids {
             rigid.begin();
@@ -338,6 +338,15 @@ impl Islands {
         }
         for (index, together) in bodies.iter().enumerate() {
             let body = &*together.body;
+            for (_, to) in body.attachments() {
+                let AttachedTo::Rigid { key, .. } = to else { continue };
+                let rigid = self.rigids.iter_mut().find(|rigid| rigid.key == key && rigid.is_sound());
+                if let Some(rigid) = rigid.filter(|rigid| !rigid.near.contains(&index))
+                    && body.config().step == h
+                {
+                    rigid.near.push(index);
+                }
+            }
             let obstacles = body.contacts().obstacles().iter();
             let mut ball = None;
             let named = obstacles.enumerate();

@@ -63,9 +63,9 @@ mod warp;
 pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, GrabId};
 pub use contact::{
-    Capsule, Contact, ContactMemory, ContactReport, ContactState, Contacts, Cuboid, DistanceGrid,
-    FixedObstacle, FixedShape, Moving, ObstacleShape, Plane, Probe, ProbeConfig, ProbeContact, Rigid, Sphere,
-    Support, SurfacePoint, Touched, contact_force,
+    AttachedTo, AttachmentId, Capsule, Contact, ContactMemory, ContactReport, ContactState, Contacts, Cuboid,
+    DistanceGrid, FixedObstacle, FixedShape, Moving, ObstacleShape, Plane, Probe, ProbeConfig, ProbeContact,
+    Rigid, Sphere, Support, SurfacePoint, Touched, contact_force,
 };
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};

@@ -19,8 +19,9 @@ const MOST_CONTACTS: usize = 16 * ContactState::MAX;
 ///
 /// A body that [`Body::restore`] makes of it goes on as the saved one would have, to the bit. The
 /// data are the running settings, the state, the grabs and the contacts. The model is not among
-/// them, and is named by its hash. Obstacles are not either: they are set anew, at the same
-/// indices.
+/// them, and is named by its hash. Obstacles and attachments are not either: obstacles are set
+/// anew, at the same indices, and what was attached is attached again, without the force of the
+/// last step.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SavedBody {
     model: Option<ModelHash>,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::{Bent, Cloud, ContactSites, Memory, ObstacleShape, Touching};
+use super::{Attachment, Bent, Cloud, ContactSites, Memory, ObstacleShape, Touching};
 use crate::{Hand, StepError};
 
 /// What a body touches.
@@ -17,6 +17,9 @@ pub enum Touched {
     Body(u64),
     /// The [`Probe`](crate::Probe) at this index of the step's list.
     Probe(usize),
+    /// What the attachment at this index of the body's list holds. No list of contacts has it: see
+    /// [`Body::attachment_force`](crate::Body::attachment_force).
+    Attachment(usize),
 }
 
 /// A contact of the last step that carried force.
@@ -159,6 +162,7 @@ pub struct Contacts {
     pub(crate) key: u64,
     friction: f64,
     obstacles: Vec<Arc<dyn ObstacleShape>>,
+    pub(crate) attachments: Vec<Attachment>,
     pub(crate) places: Option<Arc<ContactSites>>,
     /// Modes of the body for which the sites were made.
     pub(crate) modes: usize,
@@ -181,6 +185,7 @@ impl Default for Contacts {
             key: 0,
             friction: Self::FRICTION,
             obstacles: Vec::new(),
+            attachments: Vec::new(),
             places: None,
             modes: 0,
             memory: Vec::new(),
@@ -202,8 +207,9 @@ impl Contacts {
     /// Largest coefficient of friction.
     pub const MAX_FRICTION: f64 = 10.0;
 
-    /// The coefficient of Coulomb friction between the body and all obstacles, for sticking and
-    /// sliding. Default: [`Contacts::FRICTION`].
+    /// The body's coefficient of Coulomb friction, for sticking and sliding. It counts at obstacles
+    /// that have none of their own, and at others the geometric mean of both. Default:
+    /// [`Contacts::FRICTION`].
     pub fn friction(&self) -> f64 {
         self.friction
     }
@@ -233,11 +239,16 @@ impl Contacts {
         obstacles.iter().try_for_each(|obstacle| obstacle.check())?;
         let left = |memory: &Memory| match memory.other {
             Touched::Obstacle(index) => index < obstacles.len(),
-            Touched::Body(_) | Touched::Probe(_) => true,
+            Touched::Body(_) | Touched::Probe(_) | Touched::Attachment(_) => true,
         };
         self.memory.retain(left);
         self.obstacles = obstacles;
         Ok(())
+    }
+
+    /// Whether the body has neither obstacles nor attachments.
+    pub(crate) fn are_none(&self) -> bool {
+        self.obstacles.is_empty() && self.attachments.is_empty()
     }
 
     /// The contacts of the last step that carried force, in the order of obstacles and sites.
@@ -258,6 +269,12 @@ impl Contacts {
     /// Forgets the forces and anchors of the last step. A body whose state was set from elsewhere
     /// must forget them.
     pub fn forget(&mut self) {
+        self.begin_anew();
+        self.attachments.iter_mut().for_each(|attachment| attachment.force = Vector3::zeros());
+    }
+
+    /// Forgets the contacts of the last step, and keeps the forces of the attachments.
+    pub(crate) fn begin_anew(&mut self) {
         self.end();
         self.theta = 0.5;
         self.lost = 0.0;

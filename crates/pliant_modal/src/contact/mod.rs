@@ -24,6 +24,7 @@
 //! the rest shape of the other body through its deformation. `y` is then the position of one
 //! surface relative to the other, and `A` and `C` have the responses of both bodies.
 
+mod attachment;
 mod cone;
 mod contacts;
 mod distance_grid;
@@ -38,6 +39,7 @@ mod sites;
 mod solver;
 mod surface_field;
 
+pub use attachment::{AttachedTo, AttachmentId};
 pub use cone::contact_force;
 pub use contacts::{Contact, ContactMemory, ContactReport, ContactState, Contacts, Touched};
 pub use distance_grid::DistanceGrid;
@@ -46,8 +48,9 @@ pub use obstacle::{Capsule, Cuboid, Moving, ObstacleShape, Plane, Sphere, Surfac
 pub use probe::{Probe, ProbeConfig, ProbeContact};
 pub use rigid::{Rigid, Support};
 
+pub(crate) use attachment::Attachment;
 pub(crate) use indent::Indent;
-pub(crate) use point::{AtProbe, AtRigid, AtSupport, ContactPoint, Far, Memory};
+pub(crate) use point::{AtAttachment, AtProbe, AtRigid, AtSupport, ContactPoint, Far, Memory};
 pub(crate) use probe::{Grown, ProbeMemory};
 pub(crate) use rigid::Pushed;
 pub(crate) use shape::{Guess, Near, Shape, Sixes};

@@ -38,6 +38,13 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
         0.0
     }
 
+    /// Coefficient of friction of the surface, 0 to
+    /// [`Contacts::MAX_FRICTION`](crate::Contacts::MAX_FRICTION). A contact has the geometric mean
+    /// of it and of that of the body or the probe. Default: `None`, a contact has theirs.
+    fn friction(&self) -> Option<f64> {
+        None
+    }
+
     /// Checks the numbers of the obstacle.
     ///
     /// # Errors
@@ -47,7 +54,7 @@ pub trait ObstacleShape: std::fmt::Debug + Send + Sync {
     }
 
     /// The obstacle as plain data, which other machines can have. Default: `None`, for a shape that
-    /// has no such form. An obstacle that moves has none.
+    /// has no such form. An obstacle that moves or has a friction of its own has none.
     fn fixed(&self) -> Option<FixedObstacle> {
         None
     }
@@ -260,6 +267,10 @@ impl<O: ObstacleShape> ObstacleShape for Moving<O> {
 
     fn curvature(&self) -> f64 {
         self.shape.curvature()
+    }
+
+    fn friction(&self) -> Option<f64> {
+        self.shape.friction()
     }
 
     fn check(&self) -> Result<(), StepError> {

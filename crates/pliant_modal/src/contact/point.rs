@@ -3,7 +3,11 @@
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{Indent, Touched, cone::Status, surface_field::Carriers, surface_field::Place};
+use super::{
+    Indent, Touched,
+    cone::{self, Status},
+    surface_field::{Carriers, Place},
+};
 use crate::{saved::PlainMemory, step::Tangent};
 
 /// A contact of the last step.
@@ -90,6 +94,25 @@ pub(crate) struct AtSupport {
     pub(crate) arm: Vector3<f64>,
 }
 
+/// A patch at the point to which it is attached. The axes are those of the world.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct AtAttachment {
+    /// Index of the attachment in the body's list.
+    pub(crate) index: usize,
+    /// Position of the point at the beginning of the step, m, world axes.
+    pub(crate) start: Vector3<f64>,
+    /// From the point to the patch at the beginning of the step, and what may be left of it at the
+    /// end, m, world axes.
+    pub(crate) apart: Vector3<f64>,
+    pub(crate) left: Vector3<f64>,
+    /// Where the force acts on the body, m, world axes.
+    pub(crate) middle: Vector3<f64>,
+    /// Share of the torque that turns the body, and what it is attached to.
+    pub(crate) turns: [f64; 2],
+    /// Torque of the friction that calms what is attached, N m, world axes.
+    pub(crate) rub: Vector3<f64>,
+}
+
 /// A place that touches, or may touch, in this step.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ContactPoint {
@@ -105,6 +128,7 @@ pub(crate) struct ContactPoint {
     /// The side at a rigid body to which the obstacle belongs.
     pub(crate) rigid: Option<AtRigid>,
     pub(crate) support: Option<AtSupport>,
+    pub(crate) attached: Option<AtAttachment>,
     /// The law of the dent where the site leads a ball. The compliance is its tangent, and the
     /// offset has its shift.
     pub(crate) indent: Option<Indent>,
@@ -168,6 +192,7 @@ impl ContactPoint {
             probe: None,
             rigid: None,
             support: None,
+            attached: None,
             indent: None,
             friction,
             first: zero,
@@ -196,6 +221,36 @@ impl ContactPoint {
             mean: None,
             arm: zero,
         }
+    }
+
+    /// Whether the point has a force in the last computed step.
+    pub(crate) fn acts(&self) -> bool {
+        self.admits(&self.pushed) && self.pushed != Vector3::zeros()
+    }
+
+    /// Whether the point may have a force (N, contact axes): a contact does not pull.
+    pub(super) fn admits(&self, force: &Vector3<f64>) -> bool {
+        self.attached.is_some() || force[0] > 0.0
+    }
+
+    /// Force (N) for a response and a gap without the force (m), contact axes.
+    pub(super) fn law(&self, response: &Matrix3<f64>, free: &Vector3<f64>) -> (Vector3<f64>, Status) {
+        if self.attached.is_none() {
+            return cone::solve(response, free, self.friction, &self.force);
+        }
+        match response.cholesky() {
+            Some(factor) => (-factor.solve(free), Status::Stick),
+            None => (Vector3::zeros(), Status::Open),
+        }
+    }
+
+    /// Work that the step may do to take back what is amiss at its beginning, J.
+    pub(crate) fn recovery(&self) -> f64 {
+        let out = match &self.attached {
+            Some(at) => self.pushed.dot(&(at.left - at.apart)),
+            None => self.pushed[0] * (self.floor - self.gap),
+        };
+        out.max(0.0)
     }
 
     /// The sites that carry the point, with their weights.
@@ -253,6 +308,12 @@ impl ContactPoint {
         self.compliance * force + shift * self.axes.row(0).transpose()
     }
 
+    /// Takes the compliance (m/N, world axes) of a point whose axes stay.
+    pub(crate) fn comply(&mut self, compliance: Matrix3<f64>) {
+        self.compliance = compliance;
+        self.local = self.axes * compliance * self.axes.transpose();
+    }
+
     /// Turns the axes to a normal. The forces keep their direction in the world.
     pub(crate) fn turn(&mut self, normal: &Vector3<f64>) {
         let (pushed, force) = (self.axes.tr_mul(&self.pushed), self.axes.tr_mul(&self.force));
@@ -272,6 +333,9 @@ impl ContactPoint {
     /// Violation of the laws at the end of the last computed step, m.
     pub(crate) fn violation(&self) -> f64 {
         let u = self.surface();
+        if self.attached.is_some() {
+            return u.norm();
+        }
         let (n, t) = (self.pushed[0], self.pushed[1].hypot(self.pushed[2]));
         if n <= 0.0 {
             return (-u[0]).max(0.0);

@@ -20,8 +20,8 @@ pub struct ProbeConfig {
     /// Relaxation time of the damper beside the spring, its damping over the stiffness, s, 0 or
     /// more.
     pub relaxation: f64,
-    /// Coefficient of friction, 0 to [`Contacts::MAX_FRICTION`]. At a body the geometric mean with
-    /// that of the body counts, at an obstacle this one.
+    /// Coefficient of friction, 0 to [`Contacts::MAX_FRICTION`]. At a body, and at an
+    /// obstacle that has one of its own, the geometric mean of both counts.
     pub friction: f64,
 }
 

@@ -33,9 +33,9 @@ pub struct Rigid {
     pub rests: bool,
     /// Where the body touches others of its engine.
     pub supports: Vec<Support>,
-    /// Set by a step: mean force of the contacts, N.
+    /// Set by a step: mean force of contacts and attachments, N.
     pub force: [f64; 3],
-    /// Set by a step: mean torque of the contacts about the center of mass, N m, world axes.
+    /// Set by a step: mean torque of both about the center of mass, N m, world axes.
     pub torque: [f64; 3],
     /// Set by a step: the displacement of the body by the force and the acceleration, as a share of
     /// `h^2` times the acceleration that they give, 0.5 to 1.
@@ -89,7 +89,8 @@ impl Rigid {
             && self.inverse_mass.iter().all(|x| *x >= 0.0)
     }
 
-    fn inertia(&self) -> Matrix3<f64> {
+    /// Inverse inertia about the center of mass, 1/(kg m^2), world axes.
+    pub(crate) fn inertia(&self) -> Matrix3<f64> {
         Matrix3::from_fn(|i, j| self.inverse_inertia[i][j])
     }
 
@@ -136,6 +137,20 @@ impl Rigid {
         Vector3::from(self.center) + self.turned() * local
     }
 
+    /// A point of the body's axes (m) at the beginning of the step, and at its end without forces,
+    /// world axes.
+    pub(crate) fn path(&self, local: &Vector3<f64>, h: f64) -> (Vector3<f64>, Vector3<f64>) {
+        let arm = self.turned() * local;
+        let free = UnitQuaternion::from_scaled_axis(h * Vector3::from(self.angular_velocity));
+        (Vector3::from(self.center) + arm, self.free_center(h) + free * arm)
+    }
+
+    /// A point of the body's axes (m) at the end of the step, world axes.
+    pub(crate) fn end(&self, local: &Vector3<f64>, h: f64) -> Vector3<f64> {
+        let (center, (_, free)) = (self.free_center(h), self.path(local, h));
+        center + self.displacement + UnitQuaternion::from_scaled_axis(self.turn) * (free - center)
+    }
+
     /// A point at the end of the step (m) in the body's axes.
     pub(crate) fn to_local(&self, point: &Vector3<f64>, h: f64) -> Vector3<f64> {
         let free = UnitQuaternion::from_scaled_axis(h * Vector3::from(self.angular_velocity));
@@ -168,6 +183,61 @@ impl Rigid {
             return largest;
         }
         self.inertia().trace().max(0.0) * (point - Vector3::from(self.center)).norm_squared()
+    }
+
+    /// Velocity (m/s) and angular velocity (rad/s) at the end of the computed step, with what
+    /// supports do.
+    pub(crate) fn after(&self, h: f64) -> [Vector3<f64>; 2] {
+        let back = 1.0 / (self.weight * h);
+        [
+            Vector3::from(self.velocity) + back * self.displacement,
+            Vector3::from(self.angular_velocity) + back * self.turn,
+        ]
+    }
+
+    /// Energy that the computed step adds, with that in the field of the acceleration and without
+    /// what moving supports supply, and the kinetic energies before and after it together, J. A
+    /// body that a share of a torque turns counts with as much more inertia.
+    pub(crate) fn gain(&self, share: f64, h: f64) -> [f64; 2] {
+        let (before, pull) = (Vector3::from(self.velocity), Vector3::from(self.acceleration));
+        let [after, turning] = self.after(h);
+        let way = h * before + self.displacement;
+        let (mut gained, mut moving) = (0.0, 0.0);
+        for k in 0..3 {
+            let mass = if self.inverse_mass[k] > 0.0 { 1.0 / self.inverse_mass[k] } else { 0.0 };
+            gained += mass * (0.5 * (after[k] * after[k] - before[k] * before[k]) - pull[k] * way[k]);
+            moving += 0.5 * mass * (after[k] * after[k] + before[k] * before[k]);
+        }
+        // Where an axis is locked there is no inertia.
+        let own = self.inertia().symmetric_eigen();
+        for (axis, light) in own.eigenvectors.column_iter().zip(&own.eigenvalues) {
+            let inertia = if *light > 0.0 { 1.0 / (share * light) } else { 0.0 };
+            let [begun, ended] =
+                [Vector3::from(self.angular_velocity), turning].map(|turn| axis.dot(&turn).powi(2));
+            gained += 0.5 * inertia * (ended - begun);
+            moving += 0.5 * inertia * (ended + begun);
+        }
+        for support in self.supports.iter().filter(|support| support.other.is_none()) {
+            let along = Vector3::from(support.normal).dot(&Vector3::from(support.velocity));
+            gained -= h * support.force * along;
+        }
+        [gained, moving]
+    }
+
+    /// Mass, kg. Zero of a body that only turns.
+    pub(crate) fn mass(&self) -> f64 {
+        let light = self.inverse_mass.iter().copied().fold(0.0, f64::max);
+        if light > 0.0 { 1.0 / light } else { 0.0 }
+    }
+
+    /// Change of the angular velocity by a torque (N m, world axes) over a step, rad/s.
+    pub(crate) fn spun(&self, torque: &Vector3<f64>, h: f64) -> Vector3<f64> {
+        h * (self.inertia() * torque)
+    }
+
+    /// Largest inverse inertia about an axis, 1/(kg m^2).
+    pub(crate) fn turns_easily(&self) -> f64 {
+        self.inertia().symmetric_eigenvalues().max().max(0.0)
     }
 
     /// Forgets what the last step has set.

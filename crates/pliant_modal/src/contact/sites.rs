@@ -207,6 +207,14 @@ impl ContactSites {
         Ok(all)
     }
 
+    /// The patches of some sites with their weights.
+    pub(crate) fn patches<I: Iterator<Item = (usize, f64)> + Clone>(
+        &self,
+        carriers: I,
+    ) -> impl Iterator<Item = (&HeldPatch, f64)> + Clone + use<'_, I> {
+        carriers.filter_map(|(site, weight)| Some((&self.sites.get(site)?.patch, weight)))
+    }
+
     /// Finds where all sites are at the coordinates `q`.
     pub(crate) fn place(&self, field: &SurfaceField, q: &[f64], warps: bool, cloud: &mut Cloud) {
         let count = self.sites.len();

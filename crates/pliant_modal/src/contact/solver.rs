@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::{cone, point::ContactPoint};
+use super::point::ContactPoint;
 use crate::{simd::dot, step::Frame};
 
 mod direct;
@@ -195,7 +195,10 @@ impl Touching {
         self.sum.resize(self.width(), 0.0);
         let (mut count, mut local) = (0.0, 0.0);
         for (point, sides) in self.points.iter().zip(&self.sides) {
-            if point.support.is_none() && (point.off[0] < 0.0 || point.pushed[0] > 0.0) {
+            if point.support.is_none()
+                && point.attached.is_none()
+                && (point.off[0] < 0.0 || point.pushed[0] > 0.0)
+            {
                 count += 1.0;
                 local += point.local[(0, 0)];
                 for side in sides.iter().flatten() {
@@ -345,7 +348,7 @@ impl Touching {
             let moved = along(&self.spans, &self.rows, sides, &self.sum);
             // The gap if this point had no force.
             let free = point.off + moved - (point.block - point.local) * point.force;
-            let (force, status) = cone::solve(&point.block, &free, point.friction, &point.force);
+            let (force, status) = point.law(&point.block, &free);
             let step = force - point.force;
             (point.force, point.status) = (force, status);
             if step != Vector3::zeros() {

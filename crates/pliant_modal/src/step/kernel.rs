@@ -439,7 +439,7 @@ impl Kernel {
         load: &Load<'_>,
         contacts: &mut Contacts,
     ) -> Result<StepReport, StepError> {
-        if contacts.obstacles().is_empty() {
+        if contacts.are_none() {
             self.check_step(state, hands)?;
             contacts.end();
             let stepped = self.step(state, hands, load);

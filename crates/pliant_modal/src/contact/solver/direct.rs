@@ -49,7 +49,7 @@ impl Touching {
             }
             let gap = point.off + along(&self.spans, &self.rows, sides, &self.right);
             let force = -(point.stiffness * gap);
-            point.force = if force[0] > 0.0 { force } else { Vector3::zeros() };
+            point.force = if point.admits(&force) { force } else { Vector3::zeros() };
         }
         self.sum_changes();
     }
@@ -134,7 +134,7 @@ impl Touching {
     fn apply_laws(&mut self) -> f64 {
         for (point, sides) in self.points.iter_mut().zip(&self.sides) {
             let gap = point.off + along(&self.spans, &self.rows, sides, &self.z);
-            (point.force, point.status) = cone::solve(&point.local, &gap, point.friction, &point.force);
+            (point.force, point.status) = point.law(&point.local, &gap);
             point.slid = (gap + point.local * point.force).yz().norm();
         }
         self.sum_changes();
@@ -230,7 +230,7 @@ impl Touching {
                 (Status::Slip, &[n]) => point.force * (n / point.force[0]),
                 _ => continue,
             };
-            point.force = if force[0] > 0.0 { force } else { Vector3::zeros() };
+            point.force = if point.admits(&force) { force } else { Vector3::zeros() };
         }
         self.sum_changes();
     }

@@ -246,7 +246,7 @@ impl<P: Member> Group<'_, P> {
         for member in 0..self.len() {
             let alone = self.len() == 1;
             let Parts { kernel, contacts, .. } = self.parts(member);
-            if alone && !touched && contacts.obstacles().is_empty() {
+            if alone && !touched && contacts.are_none() {
                 contacts.memory.clear();
                 self.advance(work, 0.5);
                 return Ok(());
@@ -268,6 +268,11 @@ impl<P: Member> Group<'_, P> {
         let mut theta = (0..self.len()).filter_map(|member| held(self.view(member))).reduce(f64::max);
         points::begin(self, work)?;
         points::begin_probes(self, work)?;
+        if points::begin_attached(self, work) {
+            // The way of a frame that is held at a point is stable with this weight alone, and
+            // keeps the energy.
+            theta = Some(1.0);
+        }
         let known = work.points.len();
         points::begin_supports(self, work);
         points::support(self, work, true);
@@ -279,7 +284,20 @@ impl<P: Member> Group<'_, P> {
             let rounds = report.rounds;
             points::begin(self, work)?;
             points::begin_probes(self, work)?;
+            points::begin_attached(self, work);
             points::support(self, work, true);
+            report = self.attempt(work, &mut theta, false)?;
+            report.rounds += rounds;
+            report.guarded = true;
+        }
+        if self.tears(work) {
+            // They let go for this step, and draw again from the next one on.
+            work.points.retain(|point| point.attached.is_none());
+            for &index in self.pushed {
+                self.rigids[index].supports.iter_mut().for_each(|support| support.force = 0.0);
+            }
+            points::support(self, work, true);
+            let rounds = report.rounds;
             report = self.attempt(work, &mut theta, false)?;
             report.rounds += rounds;
             report.guarded = true;
@@ -287,6 +305,7 @@ impl<P: Member> Group<'_, P> {
         report.guarded |= self.stop_torn(work);
         report.guarded |= self.cap_energy(work);
         points::drill(self, work);
+        points::rub(self, work);
         report.sweeps = work.sweeps;
         self.end(work, theta.unwrap_or(0.5), &report);
         Ok(())
@@ -327,13 +346,17 @@ impl<P: Member> Group<'_, P> {
                     }
                     if let Some(far) = far {
                         let tangent = far.mean.unwrap_or(far.tangent);
-                        kernel.add_push(sites, far.carriers.iter(), &tangent, &far.arm, &-force);
-                    } else if let Some((_, carriers)) = held {
-                        let tangent = point.mean.unwrap_or(point.tangent);
-                        kernel.add_push(sites, carriers.iter(), &tangent, &point.arm, &force);
+                        kernel.add_push(sites.patches(far.carriers.iter()), &tangent, &far.arm, &-force);
+                        continue;
+                    }
+                    let (tangent, arm) = (point.mean.unwrap_or(point.tangent), &point.arm);
+                    if let Some((_, carriers)) = held {
+                        kernel.add_push(sites.patches(carriers.iter()), &tangent, arm, &force);
+                    } else if let Some(at) = point.attached {
+                        let patch = contacts.attachments.get(at.index).map(|own| (&*own.patch, 1.0));
+                        kernel.add_push(patch.into_iter(), &tangent, &(at.turns[0] * arm), &force);
                     } else {
-                        let tangent = point.mean.unwrap_or(point.tangent);
-                        kernel.add_push(sites, point.carriers(), &tangent, &point.arm, &force);
+                        kernel.add_push(sites.patches(point.carriers()), &tangent, arm, &force);
                     }
                 }
             }
@@ -451,11 +474,18 @@ impl<P: Member> Group<'_, P> {
                     && let Some(side) = &sides[0]
                 {
                     let tangent = point.mean.unwrap_or(point.tangent);
-                    let of = RowsOfSide { axes: point.axes, tangent, arm: point.arm, spin: spin.as_ref() };
+                    let arm = point.attached.map_or(1.0, |at| at.turns[0].sqrt()) * point.arm;
+                    let of = RowsOfSide { axes: point.axes, tangent, arm, spin: spin.as_ref() };
                     let rows = &mut work.rows[side.rows..][..3 * width];
                     match point.probe.as_ref().and_then(|probe| probe.first.as_ref()) {
-                        Some((_, carriers)) => view.kernel.fill_rows(sites, carriers.iter(), &of, rows),
-                        None => view.kernel.fill_rows(sites, point.carriers(), &of, rows),
+                        Some((_, carriers)) => {
+                            view.kernel.fill_rows(sites.patches(carriers.iter()), &of, rows);
+                        }
+                        None if point.attached.is_some() => {
+                            let own = point.attached.and_then(|at| view.contacts.attachments.get(at.index));
+                            view.kernel.fill_rows(own.map(|own| (&*own.patch, 1.0)).into_iter(), &of, rows);
+                        }
+                        None => view.kernel.fill_rows(sites.patches(point.carriers()), &of, rows),
                     }
                 }
                 if let (Some(far), Some(side)) = (&point.far, &sides[1])
@@ -464,7 +494,7 @@ impl<P: Member> Group<'_, P> {
                     let tangent = far.mean.unwrap_or(far.tangent);
                     let of = RowsOfSide { axes: -point.axes, tangent, arm: far.arm, spin: spin.as_ref() };
                     let rows = &mut work.rows[side.rows..][..3 * width];
-                    view.kernel.fill_rows(sites, far.carriers.iter(), &of, rows);
+                    view.kernel.fill_rows(sites.patches(far.carriers.iter()), &of, rows);
                 }
             }
         }

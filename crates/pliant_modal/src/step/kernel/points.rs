@@ -15,6 +15,7 @@ use crate::{
     step::{Frame, State, Tangent},
 };
 
+mod attached;
 mod begin;
 mod detect;
 mod drill;
@@ -22,6 +23,7 @@ mod pass;
 mod probes;
 mod rigid;
 
+pub(super) use attached::{begin_attached, rub};
 pub(super) use begin::begin;
 pub(super) use detect::detect;
 pub(super) use drill::drill;
@@ -82,6 +84,12 @@ fn find<P: Member>(group: &Group<'_, P>, key: u64) -> Option<usize> {
 /// Friction between two members.
 fn friction(a: &View<'_>, b: &View<'_>) -> f64 {
     (a.contacts.friction() * b.contacts.friction()).sqrt()
+}
+
+/// Friction of a body or a probe at an obstacle.
+fn friction_at(own: f64, obstacle: &dyn ObstacleShape) -> f64 {
+    let other = obstacle.friction().filter(|other| *other >= 0.0 && other.is_finite());
+    other.map_or(own, |other| (own * other).sqrt())
 }
 
 /// Compliance of a place of another body, m/N, world axes.
@@ -158,6 +166,10 @@ pub(super) fn linearize<P: Member>(
             probes::linearize_at_probe(group, point, recovers)?;
             continue;
         }
+        if let Some(at) = point.attached {
+            attached::linearize_attached(group, point, at, recovers, settles);
+            continue;
+        }
         if let Some(at) = point.support {
             rigid::linearize_support(group, point, at);
             continue;
@@ -227,7 +239,7 @@ pub(super) fn linearize<P: Member>(
                 point.turn(&near.normal);
                 (located, near.distance)
             }
-            (Touched::Body(_), None) | (Touched::Probe(_), _) => continue,
+            (Touched::Body(_), None) | (Touched::Probe(_) | Touched::Attachment(_), _) => continue,
         };
         point.floor = floor(point.gap, RECOVERY_SPEED * size * group.h, recovers);
         point.last = located.toward;

@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::Kernel;
 use crate::{
-    ModalModel, StepError,
+    HeldPatch, ModalModel, StepError,
     contact::{
         Carriers, Cloud, ContactSites, Contacts, Indent, ObstacleShape, Shape, Site, Sixes, SurfacePoint,
     },
@@ -175,11 +175,16 @@ impl Kernel {
 
     /// Compliance of a site, m/N, world axes.
     pub(super) fn site_compliance(&self, site: &Site, frame: &Frame, q: &[f64]) -> Matrix3<f64> {
+        self.patch_compliance(&site.patch, frame, q)
+    }
+
+    /// Residual compliance of a patch, m/N, world axes.
+    pub(super) fn patch_compliance(&self, patch: &HeldPatch, frame: &Frame, q: &[f64]) -> Matrix3<f64> {
         let mut turn: Matrix3<f64> = *frame.rotation().to_rotation_matrix().matrix();
         if self.elastic.is_some() {
-            turn *= site.patch.rotation(q);
+            turn *= patch.rotation(q);
         }
-        turn * (site.patch.residual() / self.settings.stiffness_scale) * turn.transpose()
+        turn * (patch.residual() / self.settings.stiffness_scale) * turn.transpose()
     }
 
     /// The law of the dent of a ball that touches an obstacle at one place.
@@ -253,21 +258,18 @@ impl Kernel {
         (self.push.theta, self.push.is_on) = (theta, is_on);
     }
 
-    /// Adds a contact force (N, world axes) that acts on sites with these weights. `tangent` is the
-    /// derivative of the place by the six numbers, and `arm` that about the center of mass.
-    pub(super) fn add_push(
+    /// Adds a contact force (N, world axes) that acts on patches with these weights. `tangent` is
+    /// the derivative of the place by the six numbers, and `arm` that about the center of mass.
+    pub(super) fn add_push<'a>(
         &mut self,
-        sites: &ContactSites,
-        carriers: impl Iterator<Item = (usize, f64)>,
+        carriers: impl Iterator<Item = (&'a HeldPatch, f64)>,
         tangent: &Tangent,
         arm: &Vector3<f64>,
         force: &Vector3<f64>,
     ) {
         let (six, warp): (Six, bool) = (tangent.tr_mul(force), self.warps());
-        for (site, weight) in carriers {
-            if let Some(site) = sites.sites.get(site) {
-                site.patch.rows().spread(&(weight * six), warp, &mut self.push.modal);
-            }
+        for (patch, weight) in carriers {
+            patch.rows().spread(&(weight * six), warp, &mut self.push.modal);
         }
         self.push.force += force;
         self.push.torque += arm.cross(force);
@@ -275,10 +277,9 @@ impl Kernel {
 
     /// Writes the three rows of one side of a contact: the response to a unit force along an axis
     /// is a row times another. The parts of the frame are for a weight `theta` of 1.
-    pub(super) fn fill_rows(
+    pub(super) fn fill_rows<'a>(
         &self,
-        sites: &ContactSites,
-        carriers: impl Iterator<Item = (usize, f64)> + Clone,
+        carriers: impl Iterator<Item = (&'a HeldPatch, f64)> + Clone,
         side: &RowsOfSide<'_>,
         rows: &mut [f64],
     ) {
@@ -287,10 +288,8 @@ impl Kernel {
         for (axis, row) in rows.chunks_exact_mut(modes + 6).enumerate() {
             let (modal, rigid) = row.split_at_mut(modes);
             let six: Six = along.row(axis).transpose();
-            for (site, weight) in carriers.clone() {
-                if let Some(site) = sites.sites.get(site) {
-                    site.patch.rows().spread(&(weight * six), self.warps(), modal);
-                }
+            for (patch, weight) in carriers.clone() {
+                patch.rows().spread(&(weight * six), self.warps(), modal);
             }
             self.half_response(modal);
             if let Some(spin) = side.spin {

@@ -25,17 +25,17 @@ impl<P: Member> Group<'_, P> {
     /// bend far within one step may still gain. Hands and loads do work of their own, and a
     /// material that relaxes stores energy that is not counted here: such steps are not checked.
     pub(super) fn cap_energy(&mut self, work: &mut Touching) -> bool {
-        if !work.points.iter().any(|point| point.pushed[0] > 0.0) {
+        if !work.points.iter().any(ContactPoint::acts) {
             return false;
         }
         let (mut moving, mut gained, mut scale, mut lost, mut slow) = (0.0, 0.0, 0.0, 0.0, 0.0);
         // A probe does the work of a hand.
-        if work.points.iter().any(|point| point.probe.is_some() && point.pushed[0] > 0.0) {
+        if work.points.iter().any(|point| point.probe.is_some() && point.acts()) {
             return false;
         }
         // A rigid body keeps what it has been given, whatever becomes of the members.
         let fixed = |point: &ContactPoint| point.far.is_none() && point.rigid.is_none();
-        let mut grounded = work.points.iter().any(|point| fixed(point) && point.pushed[0] > 0.0);
+        let mut grounded = work.points.iter().any(|point| fixed(point) && point.acts());
         for member in 0..self.len() {
             let View { kernel, state, hands, load, contacts } = self.view(member);
             let other = Load { modal: load.modal, ..Load::default() } != load;
@@ -62,7 +62,7 @@ impl<P: Member> Group<'_, P> {
             scale += now + before;
             gained += now - before;
             // What pushes a body out that was set into something.
-            let out = point.pushed[0] * (point.floor - point.gap).max(0.0);
+            let out = point.recovery();
             if point.far.is_none() {
                 // What the obstacles supply.
                 gained -= force.dot(&point.carried) + out;
@@ -161,10 +161,91 @@ impl<P: Member> Group<'_, P> {
     }
 }
 
+/// Violation of an attachment beyond which it lets go for a step, as a share of the size.
+const TORN_OFF: f64 = 1e-2;
+
+/// Energy that what is attached may gain in a step, as a share of what moves and is stored.
+const GAINED: f64 = 0.02;
+
+/// Share of the energy of a recovery against gravity that a step may supply to draw together what
+/// is apart.
+const DRAWN: f64 = 0.1;
+
+impl<P: Member> Group<'_, P> {
+    /// Whether the laws of the attachments could not be solved, or what is attached would gain
+    /// more energy than it may. Where hands or loads act, the energy does not count.
+    pub(super) fn tears(&self, work: &Touching) -> bool {
+        let mut attached = work.points.iter().filter(|point| point.attached.is_some()).peekable();
+        if attached.peek().is_none() {
+            return false;
+        }
+        // Comparisons with no number are false, and such a step is torn.
+        if !attached.all(|point| point.violation() <= TORN_OFF * self.size) {
+            return true;
+        }
+        let (mut gained, mut scale, mut slow) = (0.0, 0.0, 0.0);
+        for member in 0..self.len() {
+            let View { kernel, state, hands, load, .. } = self.view(member);
+            let other = Load { modal: load.modal, ..Load::default() } != load;
+            let loaded = other || load.modal.iter().any(|load| *load != 0.0);
+            if loaded || !hands.is_empty() || kernel.modes.is_viscous() {
+                return false;
+            }
+            let before = &kernel.before;
+            let moving = [kernel.kinetic_energy(before), kernel.kinetic_energy(state)];
+            let bent = [kernel.elastic_energy(before), kernel.elastic_energy(state)];
+            gained += moving[1] - moving[0] + bent[1] - bent[0];
+            gained += kernel.potential_energy(state) - kernel.potential_energy(before);
+            scale += moving.iter().chain(&bent).sum::<f64>();
+            let own = work.points.iter().find(|point| point.member == member);
+            let share = own.and_then(|point| point.attached).map_or(1.0, |at| at.turns[0]);
+            if share < 1.0 && kernel.model.is_free() {
+                // A body that a share of a torque turns counts with as much more inertia.
+                let turning = |state: &State| {
+                    let spin = Vector3::from(state.frame.spin());
+                    0.5 * spin.dot(&state.frame.angular_velocity(&kernel.model))
+                };
+                gained += (1.0 / share - 1.0) * (turning(state) - turning(before));
+            }
+            let gravity = Vector3::from(kernel.settings.gravity).norm();
+            slow += slowly(kernel.model.mass(), gravity, [self.size, self.h]);
+        }
+        for &index in self.pushed {
+            let rigid = &self.rigids[index];
+            let own = work.points.iter().find(|point| point.rigid.is_some_and(|at| at.rigid == index));
+            let share = own.and_then(|point| point.attached).map_or(1.0, |at| at.turns[1]);
+            let [change, moving] = rigid.gain(share, self.h);
+            gained += change;
+            scale += moving;
+            slow += slowly(rigid.mass(), Vector3::from(rigid.acceleration).norm(), [self.size, self.h]);
+        }
+        let mut recovered = 0.0;
+        for point in &work.points {
+            let force = point.world_force();
+            gained += point.stored(&force) - point.stored_before;
+            scale += point.stored(&force) + point.stored_before;
+            recovered += point.recovery();
+            if point.far.is_none() && point.rigid.is_none() {
+                gained -= force.dot(&point.carried);
+            }
+        }
+        gained -= recovered.min(DRAWN * slow);
+        let calm = gained <= GAINED * scale;
+        !calm
+    }
+}
+
+/// Energy that moves a mass (kg) at the speed of the recovery against gravity (m/s^2) in a step, J.
+fn slowly(mass: f64, gravity: f64, [size, h]: [f64; 2]) -> f64 {
+    let speed = points::RECOVERY_SPEED * size;
+    mass * speed * (0.5 * speed + gravity * h)
+}
+
 /// Whether the contacts did more work on the bodies than they are allowed to.
 pub(super) fn gained(work: &Touching, recovers: bool) -> bool {
     let (mut done, mut allowed, mut scale) = (0.0, 0.0, 0.0f64);
-    for point in &work.points {
+    // An attachment takes as much as it gives, and what is amiss of its law has either sign.
+    for point in work.points.iter().filter(|point| point.attached.is_none()) {
         let force = point.world_force();
         let along = force.dot(&(point.end - point.start - point.carried)) + point.rolled(&force);
         // A dent that turns with the site is no work of the contact.
@@ -172,7 +253,7 @@ pub(super) fn gained(work: &Touching, recovers: bool) -> bool {
         done += along + stored - before;
         scale += along.abs() + stored + before;
         if recovers {
-            allowed += point.pushed[0] * (point.floor - point.gap).max(0.0);
+            allowed += point.recovery();
         }
     }
     done > 1.5 * allowed + 1e-9 * scale

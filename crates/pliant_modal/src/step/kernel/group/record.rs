@@ -14,6 +14,10 @@ impl<P: Member> Group<'_, P> {
         for member in 0..self.len() {
             let contacts = self.parts(member).contacts;
             contacts.memory.clear();
+            for attachment in &mut contacts.attachments {
+                attachment.force = Vector3::zeros();
+                attachment.largest *= 0.95;
+            }
             contacts.report = *report;
         }
         work.points.sort_unstable_by_key(|point| {
@@ -21,6 +25,7 @@ impl<P: Member> Group<'_, P> {
                 Touched::Obstacle(index) => (0, index as u64),
                 Touched::Body(key) => (1, key),
                 Touched::Probe(index) => (2, index as u64),
+                Touched::Attachment(index) => (3, index as u64),
             };
             (point.member, other, point.site)
         });
@@ -35,6 +40,14 @@ impl<P: Member> Group<'_, P> {
                 probe.memory.extend(memory);
             }
             let force = point.world_force();
+            if let Some(at) = point.attached {
+                let own = self.parts(point.member).contacts.attachments.get_mut(at.index);
+                if let Some(own) = own.filter(|_| force.iter().all(|x| x.is_finite())) {
+                    own.force = force;
+                    own.largest = force.norm().max(own.largest);
+                }
+                continue;
+            }
             if point.pushed[0] <= 0.0 || !force.iter().all(|x| x.is_finite()) {
                 continue;
             }

@@ -6,7 +6,7 @@ use super::super::{
     group::{Group, Member, View},
     touch::look,
 };
-use super::{DEEP, carried, far_compliance, far_side, find, friction, locate_at_body, rigid};
+use super::{DEEP, carried, far_compliance, far_side, find, friction, friction_at, locate_at_body, rigid};
 use crate::{
     StepError,
     contact::{
@@ -27,7 +27,7 @@ pub(in super::super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touchi
         for memory in &view.contacts.memory {
             let Some(mut site) = sites.sites.get(memory.site) else { continue };
             match memory.other {
-                Touched::Probe(_) => {}
+                Touched::Probe(_) | Touched::Attachment(_) => {}
                 Touched::Obstacle(index) => {
                     let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
                     let mut memory = *memory;
@@ -92,7 +92,8 @@ fn begin_at_obstacle<P: Member>(
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let at = (sites, site);
     let located = kernel.locate(at, obstacle, frame, q, leads.as_ref())?;
-    let mut point = ContactPoint::new(member, memory.site, memory.other, view.contacts.friction());
+    let friction = friction_at(view.contacts.friction(), obstacle);
+    let mut point = ContactPoint::new(member, memory.site, memory.other, friction);
     (point.first, point.last) = (memory.toward, located.toward);
     (point.start, point.tangent) = kernel.material(at, &memory.toward, frame, q, leads.as_ref());
     point.carried = carried(obstacle, &located.point, kernel.h)?;

@@ -7,7 +7,10 @@ use super::super::{
     touch::{Located, look},
 };
 use super::pass::{PARTS, march, pass};
-use super::{DEEP, NARROW, NEAR, carried, far_compliance, far_side, friction, locate_at_body, rigid, share};
+use super::{
+    DEEP, NARROW, NEAR, carried, far_compliance, far_side, friction, friction_at, locate_at_body, rigid,
+    share,
+};
 use crate::{
     StepError,
     contact::{Clearance, ContactPoint, ContactSites, Guess, Look, ObstacleShape, Touched, Touching},
@@ -235,7 +238,8 @@ fn detect_at_obstacle<P: Member>(
             found = passed;
             hit = true;
         }
-        let mut point = ContactPoint::new(member, number, other, view.contacts.friction());
+        let friction = friction_at(view.contacts.friction(), free);
+        let mut point = ContactPoint::new(member, number, other, friction);
         (point.first, point.last, point.start) = (located.toward, located.toward, start);
         point.tangent = tangent;
         let by_itself = carried(free, &located.point, kernel.h)?;

@@ -9,7 +9,7 @@ use super::super::{
 use super::{
     RECOVERY_SPEED,
     begin::{SNAPPED, resume},
-    carried, carrier_compliance, find, floor,
+    carried, carrier_compliance, find, floor, friction_at,
     pass::march,
     share,
 };
@@ -56,6 +56,7 @@ pub(in super::super) fn begin_probes<P: Member>(
                 Touched::Obstacle(at) => {
                     let Some(obstacle) = probe.obstacles().get(at) else { continue };
                     let found = look(&**obstacle, &probe.start)?;
+                    let friction = friction_at(friction, &**obstacle);
                     let mut point = ContactPoint::new(span, at, memory.other, friction);
                     point.carried = carried(&**obstacle, &probe.start, group.h)?;
                     point.start = probe.start;
@@ -84,7 +85,7 @@ pub(in super::super) fn begin_probes<P: Member>(
                     resume(&mut point, memory.force, &normal, memory.anchor, -probe.start, farthest);
                     point
                 }
-                Touched::Probe(_) => continue,
+                Touched::Probe(_) | Touched::Attachment(_) => continue,
             };
             work.points.push(point);
         }
@@ -140,7 +141,8 @@ pub(in super::super) fn detect_probes<P: Member>(
             if found.distance >= radius {
                 continue;
             }
-            let mut point = ContactPoint::new(span, at, Touched::Obstacle(at), probe.config().friction);
+            let friction = friction_at(probe.config().friction, &**obstacle);
+            let mut point = ContactPoint::new(span, at, Touched::Obstacle(at), friction);
             point.start = from;
             point.carried = carried(&**obstacle, &to, group.h)?;
             point.gap = look(&grown, &(from + point.carried))?.distance;

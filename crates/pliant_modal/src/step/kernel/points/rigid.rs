@@ -112,6 +112,10 @@ pub(in super::super) fn set_arms<P: Member>(group: &Group<'_, P>, point: &mut Co
     if let Some(far) = &mut point.rigid {
         far.arm = middle - group.rigids[far.rigid].pivot(weight, group.h);
     }
+    if let Some(at) = point.attached {
+        point.arm = at.middle - group.view(point.member).kernel.pivot(weight);
+        return;
+    }
     match &mut point.support {
         Some(at) => at.arm = middle - group.rigids[at.rigid].pivot(weight, group.h),
         None if point.rigid.is_some() => {
@@ -122,15 +126,19 @@ pub(in super::super) fn set_arms<P: Member>(group: &Group<'_, P>, point: &mut Co
 }
 
 /// Sum of the forces of the points on a rigid body, and their torque about its center.
-pub(in super::super) fn sum(points: &[ContactPoint], index: usize) -> [Vector3<f64>; 2] {
+fn sum(points: &[ContactPoint], index: usize) -> [Vector3<f64>; 2] {
     let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
     for point in points {
         let near = point.support.filter(|at| at.rigid == index).map(|at| (1.0, at.arm));
-        let far = point.rigid.filter(|at| at.rigid == index).map(|at| (-1.0, at.arm));
+        let share = point.attached.map_or(1.0, |at| at.turns[1]);
+        let far = point.rigid.filter(|at| at.rigid == index).map(|at| (-1.0, share * at.arm));
         for (sign, arm) in near.into_iter().chain(far) {
             let pull = sign * point.world_force();
             force += pull;
             torque += arm.cross(&pull);
+        }
+        if let Some(at) = point.attached.filter(|_| far.is_some()) {
+            torque += at.rub;
         }
     }
     [force, torque]
@@ -154,7 +162,8 @@ pub(in super::super) fn respond<P>(group: &mut Group<'_, P>, work: &Touching, we
 pub(in super::super) fn fill_rows(rigids: &[Rigid], work: &mut Touching, h: f64) {
     for (point, sides) in work.points.iter().zip(&work.sides) {
         let near = point.support.map(|at| (at.rigid, at.arm, point.axes, sides[0]));
-        let far = point.rigid.map(|at| (at.rigid, at.arm, -point.axes, sides[1]));
+        let share = point.attached.map_or(1.0, |at| at.turns[1].sqrt());
+        let far = point.rigid.map(|at| (at.rigid, share * at.arm, -point.axes, sides[1]));
         for (rigid, arm, axes, side) in near.into_iter().chain(far) {
             if let Some(side) = side {
                 rigids[rigid].fill_rows(&axes, &arm, h, &mut work.rows[side.rows..][..18]);
