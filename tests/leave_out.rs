@@ -66,9 +66,9 @@ fn each_plugin_brings_its_own_systems_and_no_other() {
             app.add_plugins((PliantBodyPlugin::default(), ContactPlugin::default()));
         });
         let contact = touching - none - body;
-        // Two of the engine's keep the assets of distance fields. Four more are for avian's
-        // colliders, which do not run without avian.
-        let most = if cfg!(feature = "contact-avian") { 4 + 2 + 4 } else { 4 + 2 };
+        // Two of the engine's keep the assets of distance fields. Six more are for avian's
+        // colliders and attachments, which do not run without avian.
+        let most = if cfg!(feature = "contact-avian") { 4 + 2 + 6 } else { 4 + 2 };
         assert!((1..=most).contains(&contact), "{contact} systems of the contacts");
     }
     #[cfg(feature = "net")]

@@ -65,7 +65,7 @@
 //! | `picking` | yes | Bevy's picking, with which pointers drag the bodies |
 //! | `contact` | no | obstacles that bodies touch, and bodies that touch each other |
 //! | `contact-mesh` | no | convex hulls and triangle meshes as obstacles |
-//! | `contact-avian` | no | colliders and rigid bodies of avian3d 0.7, with forces both ways |
+//! | `contact-avian` | no | colliders and rigid bodies of avian3d 0.7, with forces both ways, and attachments to them |
 //! | `net` | no | sessions over QUIC |
 //! | `states` | no | the state of the session as a state of Bevy, with `net` |
 //! | `watch` | no | sessions for watchers without number, over relays, with `net` |
@@ -77,6 +77,7 @@
 //! None of them asks Bevy for a window, a user interface, threads (`multi_threaded`) or types that
 //! register themselves (`reflect_auto_register`). These are the game's to choose.
 
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -176,6 +177,8 @@ pub mod prelude {
     pub use crate::body::{PliantGizmos, SurfaceDeformation, SurfaceDetail, SurfaceShading};
     #[cfg(feature = "picking")]
     pub use crate::body::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
+    #[cfg(feature = "contact-avian")]
+    pub use crate::contact::{Attachment, AttachmentForce};
     #[cfg(feature = "contact")]
     pub use crate::contact::{
         BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,

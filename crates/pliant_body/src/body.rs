@@ -11,8 +11,8 @@ use bevy::{
     reflect::reflect_remote,
 };
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, ObstacleShape, Precision, Relaxation,
-    StepError, StepSettings,
+    AttachedTo, AttachmentId, Body, BodyConfig, Elasticity, GrabId, Integrator, ModalModel, ObstacleShape,
+    Precision, Relaxation, StepError, StepSettings,
 };
 
 use crate::{BodyGravityScale, Inertia, ModalAsset, VisualState, grab::GrabHold, gravity::Pull};
@@ -268,6 +268,8 @@ pub struct BodyState {
     pub(crate) stepped: bool,
     /// Layers of the contact with other bodies, see [`BodyState::touch_bodies`].
     pub(crate) layers: Option<[u32; 2]>,
+    /// Layers of the contact with probes, see [`BodyState::set_probe_layers`].
+    pub(crate) probe_layers: [u32; 2],
 }
 
 /// The solver's record of a grab.
@@ -297,6 +299,7 @@ impl BodyState {
             resting: false,
             stepped: false,
             layers: None,
+            probe_layers: [u32::MAX; 2],
         }
     }
 
@@ -325,6 +328,21 @@ impl BodyState {
     pub fn body_mut(&mut self) -> &mut Body {
         self.wake();
         &mut self.body
+    }
+
+    /// Moves the point of an attachment ([`Body::set_attachment`]). A resting body wakes if the
+    /// point is another one or moves.
+    ///
+    /// # Errors
+    /// Returns those of [`Body::set_attachment`]. The old point then stays.
+    pub fn set_attachment(&mut self, id: AttachmentId, to: AttachedTo) -> Result<(), StepError> {
+        let before = self.body.attachments().find(|(known, _)| *known == id);
+        self.body.set_attachment(id, to)?;
+        let moves = matches!(to, AttachedTo::World { velocity, .. } if velocity != [0.0; 3]);
+        if moves || before != Some((id, to)) {
+            self.wake();
+        }
+        Ok(())
     }
 
     /// Gives the body its obstacles ([`Body::set_obstacles`]). A resting body wakes only if it
@@ -404,6 +422,19 @@ impl BodyState {
     /// Layers of the contact with other bodies, see [`BodyState::touch_bodies`].
     pub fn body_layers(&self) -> Option<[u32; 2]> {
         self.layers
+    }
+
+    /// Sets which probes touch the body: those of which the `[memberships, filters]`
+    /// ([`ProbeState::set_layers`](crate::ProbeState::set_layers)) each have a bit of the body's
+    /// filters and memberships. Default: all bits, all probes. The contact plugin sets them at
+    /// every tick.
+    pub fn set_probe_layers(&mut self, layers: [u32; 2]) {
+        self.probe_layers = layers;
+    }
+
+    /// Layers of the contact with probes, see [`BodyState::set_probe_layers`].
+    pub fn probe_layers(&self) -> [u32; 2] {
+        self.probe_layers
     }
 
     /// Returns the surface that is shown: one position per surface vertex, m, body axes.

@@ -14,8 +14,8 @@ pub enum BodyError {
         /// The refused target, m.
         target: [f64; 3],
     },
-    /// The model does not have the patch of the grab.
-    #[error("this grab holds nothing: {0}")]
+    /// The model does not have the patch of a grab or an attachment.
+    #[error("the patch holds nothing: {0}")]
     Patch(ModelError),
     /// The body refused the grab.
     #[error("the grab was refused: {0}")]
@@ -68,6 +68,13 @@ pub enum BodyError {
     /// [`SurfaceAnchor`](crate::SurfaceAnchor).
     #[error("the body has no such place on its surface; the entity stays where it is")]
     NoSurfacePlace,
+    /// The soft or the rigid body of an attachment does not exist, or the surface does not have its
+    /// place.
+    #[error("the attachment holds nothing: its bodies or its place on the surface do not exist")]
+    NotAttached,
+    /// The body refused an attachment or its point.
+    #[error("the attachment was refused: {0}")]
+    Attachment(StepError),
     /// An obstacle has a number that is not finite or out of range. Bodies do not touch it.
     #[error("the obstacle was refused: {0}")]
     Obstacle(StepError),
@@ -106,8 +113,8 @@ pub enum BodyError {
 #[derive(EntityEvent, Reflect, Debug)]
 #[reflect(Debug, from_reflect = false)]
 pub struct BodyRefused {
-    /// The entity of the refused component, or the entity that a message named: a body, a grab or a
-    /// surface anchor.
+    /// The entity of the refused component, or the entity that a message named: a body, a grab, an
+    /// attachment or a surface anchor.
     pub entity: Entity,
     /// The error: the expected and the actual input.
     #[reflect(ignore)]

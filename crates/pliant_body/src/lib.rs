@@ -40,6 +40,7 @@
 //! `bake`: adds `BakePlugin`, which meshes and bakes bodies inside the game from a `BakeRequest`
 //! or a `BakeNode`, and bakes files when assets are processed.
 //! Without this feature bodies are loaded from `.modal` files and no part of the bake is compiled.
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

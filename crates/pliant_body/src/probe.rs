@@ -22,8 +22,8 @@ pub struct TouchProbe {
     pub stiffness: f64,
     /// Relaxation time of the damper beside the spring, s, 0 or more. Default: `0.001`.
     pub relaxation: f64,
-    /// Coefficient of friction, 0 to 10. At a body the geometric mean with that of the body counts.
-    /// Default: `0.5`.
+    /// Coefficient of friction, 0 to 10. At a body, and at an obstacle that has one of its
+    /// own, the geometric mean of both counts. Default: `0.5`.
     pub friction: f64,
     /// Whether the ball touches anything. Default: `true`.
     pub enabled: bool,
@@ -64,15 +64,22 @@ pub struct Touching {
 }
 
 /// State of a [`TouchProbe`] after the last step.
-#[derive(Component, Debug, Default)]
+#[derive(Component, Debug)]
 pub struct ProbeState {
     /// The solver's probe. `None` while it touches nothing, or was refused.
     probe: Option<Probe>,
     /// Scale of the bodies that it touches.
     scale: f64,
     obstacles: Vec<Entity>,
+    layers: [u32; 2],
     /// Whether the settings were refused, so that it is reported once.
     refused: bool,
+}
+
+impl Default for ProbeState {
+    fn default() -> Self {
+        Self { probe: None, scale: 0.0, obstacles: Vec::new(), layers: [u32::MAX; 2], refused: false }
+    }
 }
 
 impl ProbeState {
@@ -94,7 +101,7 @@ impl ProbeState {
             let other = match contact.other {
                 Touched::Obstacle(index) => *self.obstacles.get(index)?,
                 Touched::Body(bits) => Entity::try_from_bits(bits)?,
-                Touched::Probe(_) => return None,
+                Touched::Probe(_) | Touched::Attachment(_) => return None,
             };
             Some(Touching {
                 other,
@@ -131,6 +138,18 @@ impl ProbeState {
             self.obstacles = entities;
         }
         Ok(())
+    }
+
+    /// Sets the `[memberships, filters]` of the probe, which decide which bodies it touches
+    /// ([`BodyState::set_probe_layers`](crate::BodyState::set_probe_layers)). Default: all bits.
+    /// The contact plugin sets them at every tick.
+    pub fn set_layers(&mut self, layers: [u32; 2]) {
+        self.layers = layers;
+    }
+
+    /// The `[memberships, filters]` of the probe.
+    pub fn layers(&self) -> [u32; 2] {
+        self.layers
     }
 
     pub(crate) fn scale(&self) -> f64 {

@@ -24,6 +24,7 @@ use crate::{BodyState, HeldShapesCache, ModalBody, body::HeldBody, grab::GrabHol
 /// own shapes of its held patches are made again, and this component goes. Pause `Time<Virtual>`
 /// until all bodies are there, where they have to go on together. If the data do not fit the model,
 /// the body starts at rest, and [`BodyRefused`](crate::BodyRefused) reports why.
+/// Attachments begin anew, without the force of the last step.
 ///
 /// Two things begin anew: motion of the entity that the body feels ([`Inertia`](crate::Inertia)),
 /// and grabs that were made through [`BodyState::body_mut`], which are not saved.

@@ -372,7 +372,8 @@ pub(crate) fn step_bodies(
         all.clear();
     }
     let (mut held, mut taken) = take_probes(&mut probes, &all, &mut refusals);
-    let traits: Vec<_> = all.iter().map(|(.., state)| (state.layers, state.scale)).collect();
+    let traits: Vec<_> =
+        all.iter().map(|(.., state)| (state.layers, state.scale, state.probe_layers)).collect();
     let mut together: Vec<Together<'_>> = Vec::with_capacity(all.len());
     for (name, _, state) in &mut all {
         let (resting, layers) = (state.resting, state.layers);
@@ -390,12 +391,15 @@ pub(crate) fn step_bodies(
         together.push(member);
     }
     let may_touch = |a: usize, b: usize| {
-        let ((Some([memberships, filters]), scale), (Some(other), of_other)) = (traits[a], traits[b]) else {
+        let ((Some(own), scale, _), (Some(other), of_other, _)) = (traits[a], traits[b]) else {
             return false;
         };
-        scale == of_other && memberships & other[1] != 0 && other[0] & filters != 0
+        scale == of_other && meet(own, other)
     };
-    let may_probe = |probe: usize, body: usize| held[probe].1 == traits[body].1;
+    let may_probe = |probe: usize, body: usize| {
+        let ((_, own, layers), (_, scale, others)) = (held[probe], traits[body]);
+        own == scale && meet(layers, others)
+    };
     if let Some(rigids) = &mut rigids {
         std::mem::swap(&mut islands.rigids, &mut rigids.0);
     }
@@ -404,7 +408,7 @@ pub(crate) fn step_bodies(
         std::mem::swap(&mut islands.rigids, &mut rigids.0);
     }
     let results: Vec<_> = together.into_iter().map(|member| (member.resting, member.error)).collect();
-    for ((entity, _), probe) in held.drain(..).zip(taken) {
+    for ((entity, ..), probe) in held.drain(..).zip(taken) {
         if let Ok((.., mut state)) = probes.get_mut(entity) {
             state.give(probe);
         }
@@ -466,22 +470,30 @@ pub(crate) fn batches<T: Send>(items: &mut [T], worth: bool, run: impl Fn(&mut [
     }
 }
 
-/// Takes the probes for a step: the entity of each and the scale of the bodies that it touches, and
-/// the probes.
+/// Whether two layers, each `[memberships, filters]`, let their owners touch.
+fn meet(own: [u32; 2], other: [u32; 2]) -> bool {
+    own[0] & other[1] != 0 && other[0] & own[1] != 0
+}
+
+/// Takes the probes for a step: the entity of each, the scale of the bodies that it touches and its
+/// layers, and the probes.
 fn take_probes(
     probes: &mut Query<(NameOrEntity, &TouchProbe, &mut ProbeState)>,
     bodies: &[(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)],
     refusals: &mut Refusals,
-) -> (Vec<(Entity, f64)>, Vec<Probe>) {
+) -> (Vec<(Entity, f64, [u32; 2])>, Vec<Probe>) {
     let (mut held, mut taken) = (Vec::new(), Vec::new());
     for (name, wanted, mut state) in probes {
         let away = |state: &BodyState| {
             (DVec3::from(state.body.frame().center()) * state.scale).distance_squared(wanted.target)
         };
-        let nearest = bodies.iter().min_by(|a, b| away(&a.2).total_cmp(&away(&b.2)));
+        let touched = |(.., body): &&(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)| {
+            meet(state.layers(), body.probe_layers)
+        };
+        let nearest = bodies.iter().filter(touched).min_by(|a, b| away(&a.2).total_cmp(&away(&b.2)));
         match state.take(wanted, nearest.map_or(1.0, |(.., state)| state.scale)) {
             Ok(Some(probe)) => {
-                held.push((name.entity, state.scale()));
+                held.push((name.entity, state.scale(), state.layers()));
                 taken.push(probe);
             }
             Ok(None) => {}
@@ -490,7 +502,7 @@ fn take_probes(
     }
     // In one order, so that the order of archetypes makes no difference.
     let mut order: Vec<_> = held.into_iter().zip(taken).collect();
-    order.sort_by_key(|((entity, _), _)| entity.to_bits());
+    order.sort_by_key(|((entity, ..), _)| entity.to_bits());
     order.into_iter().unzip()
 }
 
@@ -502,7 +514,7 @@ fn rest(all: &mut [(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)]) {
         let stirred = |(.., state): &(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)| {
             state.body.contacts().contacts().iter().any(|contact| match contact.other {
                 Touched::Body(bits) => index(bits).is_some_and(|other| !calm[other]),
-                Touched::Obstacle(_) | Touched::Probe(_) => false,
+                Touched::Obstacle(_) | Touched::Probe(_) | Touched::Attachment(_) => false,
             })
         };
         let next: Vec<bool> = all.iter().zip(&calm).map(|(body, calm)| *calm && !stirred(body)).collect();

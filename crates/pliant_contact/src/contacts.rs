@@ -10,10 +10,14 @@ use pliant_modal::{self as modal, StepError};
 
 use crate::obstacle::{ContactLayers, Motion, Nothing};
 
-/// Coefficient of Coulomb friction between a body and all obstacles, 0 to 10. Between two bodies
-/// the coefficient is the geometric mean of both.
+/// Coefficient of Coulomb friction of a body, 0 to 10, with all obstacles that have none of their
+/// own. Between two bodies the coefficient is the geometric mean of both.
 ///
-/// A body without this component has the friction of [`BodyFriction::default`].
+/// A body without this component has the friction of [`BodyFriction::default`]. On an
+/// [`Obstacle`](crate::Obstacle) it is that of ice or rubber: the coefficient with a body or a
+/// probe is then the geometric mean of both. Guests do not step contacts with such an obstacle
+/// themselves, and among peers bodies do not touch it. Of avian's colliders its `Friction` counts
+/// likewise, where they have one.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Debug, Clone, PartialEq)]
 pub struct BodyFriction(pub f64);
@@ -109,6 +113,9 @@ pub struct ContactEnded {
 pub(crate) struct Nearby {
     #[entities]
     pub(crate) slots: Vec<Option<Entity>>,
+    /// The rigid bodies to which the body is attached, which it does not touch.
+    #[entities]
+    pub(crate) attached: Vec<Entity>,
     /// The friction that was refused, so that it is reported once.
     refused: Option<f64>,
 }
@@ -169,7 +176,7 @@ pub(crate) fn place_obstacles(
     obstacles: Query<(Entity, &Motion, Option<Ref<ContactLayers>>)>,
     mut last: Local<Vec<Entity>>,
     mut bodies: Bodies,
-    mut probes: Query<(Entity, &TouchProbe, &mut ProbeState)>,
+    mut probes: Query<(Entity, &TouchProbe, &mut ProbeState, Option<&ContactLayers>)>,
 ) {
     let step = time.delta_secs_f64();
     // In the order of entities, so that the order of archetypes makes no difference.
@@ -183,8 +190,8 @@ pub(crate) fn place_obstacles(
     }
     let stirred: Vec<_> =
         all.iter().filter(|(_, motion, layers)| motion.changed || changed(layers)).collect();
-    for (entity, probe, mut state) in &mut probes {
-        if let Err(error) = give_probe(&all, probe, &mut state) {
+    for (entity, probe, mut state, layers) in &mut probes {
+        if let Err(error) = give_probe(&all, probe, &mut state, layers.copied().unwrap_or_default()) {
             commands.trigger(BodyRefused { entity, error: BodyError::Obstacle(error) });
         }
     }
@@ -214,6 +221,7 @@ pub(crate) fn place_obstacles(
                 local
                     && layers.touch(other.as_deref().copied().unwrap_or_default())
                     && motion.distance(scale, &center) <= reach
+                    && !motion.belongs(&nearby.attached)
             })
             .map(|(entity, motion, _)| (*entity, *motion))
             .collect();
@@ -283,13 +291,18 @@ fn give_probe(
     all: &[(Entity, &Motion, Option<Ref<ContactLayers>>)],
     probe: &TouchProbe,
     state: &mut ProbeState,
+    layers: ContactLayers,
 ) -> Result<(), StepError> {
+    state.set_layers([layers.memberships, layers.filters]);
     let Some((center, scale)) = state.around() else { return Ok(()) };
     let reach = NEAR + 3.0 * probe.radius + 2.0 * center.distance(probe.target);
     let local = Vector3::from((center / scale).to_array());
     let near: Vec<(Entity, &Motion)> = all
         .iter()
-        .filter(|(_, motion, _)| motion.distance(scale, &local) * scale <= reach)
+        .filter(|(_, motion, other)| {
+            layers.touch(other.as_deref().copied().unwrap_or_default())
+                && motion.distance(scale, &local) * scale <= reach
+        })
         .map(|(entity, motion, _)| (*entity, *motion))
         .collect();
     let same = near.iter().map(|(entity, _)| *entity).eq(state.obstacles().iter().copied());
@@ -315,6 +328,9 @@ pub(crate) fn touch_bodies(
     awake.clear();
     for (entity, mut state, driven, _, touches, layers) in &mut bodies {
         let ContactLayers { memberships, filters } = layers.copied().unwrap_or_default();
+        if state.probe_layers() != [memberships, filters] {
+            state.bypass_change_detection().set_probe_layers([memberships, filters]);
+        }
         let wanted = (touches && *driven == Driven::Local).then_some([memberships, filters]);
         if state.body_layers() != wanted {
             state.touch_bodies(wanted);
@@ -350,7 +366,7 @@ pub(crate) fn publish(
                 modal::Touched::Obstacle(index) => nearby.slots.get(index).copied().flatten()?,
                 modal::Touched::Body(bits) => Entity::try_from_bits(bits)?,
                 // The contacts of a hand's probe are reported there.
-                modal::Touched::Probe(_) => return None,
+                modal::Touched::Probe(_) | modal::Touched::Attachment(_) => return None,
             };
             Some(ContactPoint {
                 other,

@@ -24,18 +24,19 @@
 //! | Written by you | Read by you |
 //! | --- | --- |
 //! | [`Obstacle`] with a `Transform`: a rigid shape | [`BodyContacts`] on a body: where it touches, with forces |
-//! | [`BodyFriction`] on a body | [`ContactStarted`], [`ContactEnded`]: events on the body, for observers |
+//! | [`BodyFriction`] on a body or an obstacle | [`ContactStarted`], [`ContactEnded`]: events on the body, for observers |
 //! | [`TouchBodies`] on bodies: they touch each other | |
-//! | [`ContactLayers`] on bodies and obstacles: who touches whom | [`BodyRefused`](pliant_body::BodyRefused): a refused obstacle |
+//! | [`ContactLayers`] on bodies, obstacles and probes: who touches whom | [`BodyRefused`](pliant_body::BodyRefused): a refused obstacle |
 //!
 //! With the feature `avian` all colliders of avian3d 0.7 are obstacles too, and bodies push its
-//! dynamic rigid bodies, as they are pushed. An [`Obstacle`] pushes bodies, and bodies do not push
-//! it. Bodies push each other. A body does not
-//! touch itself. A body that another source moves
-//! ([`Driven::Remote`](pliant_body::Driven::Remote)) touches nothing here.
+//! dynamic rigid bodies, as they are pushed. An `Attachment` ties a place of a body to a point of a
+//! rigid body, and `AttachmentForce` has the force. An [`Obstacle`] pushes bodies, and bodies do
+//! not push it. Bodies push each other. A body does not touch itself. A body that another source
+//! moves ([`Driven::Remote`](pliant_body::Driven::Remote)) touches nothing here.
 //!
-//! A body with no obstacle nearby has no contact work. The first obstacle that comes near chooses
-//! the contact sites of the body's model, once for each model.
+//! A body with no obstacle nearby has no contact work. The first obstacle that comes near, or
+//! the first attachment, chooses the contact sites of the body's model, once for each model.
+#![cfg_attr(docsrs, feature(doc_cfg))]
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -57,6 +58,8 @@ use bevy::{
 };
 use pliant_body::PliantSystems;
 
+#[cfg(feature = "avian")]
+pub use avian::{Attachment, AttachmentForce};
 pub use contacts::{BodyContacts, BodyFriction, ContactEnded, ContactPoint, ContactStarted, TouchBodies};
 pub use distance_field::DistanceField;
 pub use obstacle::{ContactLayers, Obstacle};

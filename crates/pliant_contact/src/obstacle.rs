@@ -10,9 +10,9 @@ use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused, Pose};
 use pliant_modal as modal;
 
-use crate::DistanceField;
 #[cfg(feature = "mesh")]
 use crate::mesh::Solids;
+use crate::{BodyFriction, DistanceField};
 
 /// A rigid shape that bodies touch, at the entity's `Transform`.
 ///
@@ -60,8 +60,8 @@ pub enum Obstacle {
     Field(Handle<DistanceField>),
 }
 
-/// Selects what touches what: a body and an obstacle touch if each one's filters have a bit of the
-/// other's memberships.
+/// Selects what touches what: a body and an obstacle, or a probe and either, touch if each one's
+/// filters have a bit of the other's memberships.
 ///
 /// An entity without this component is a member of all layers and touches all layers.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
@@ -120,9 +120,13 @@ pub(crate) struct Motion {
     rotation: DQuat,
     velocity: DVec3,
     spin: DVec3,
-    /// The body of another engine that gives way to soft bodies.
+    /// The rigid body of another engine to which it belongs.
+    of: Option<Entity>,
+    /// The same if it gives way to soft bodies.
     #[cfg(feature = "avian")]
     pub(crate) rigid: Option<Entity>,
+    /// Its own coefficient of friction.
+    friction: Option<f64>,
     /// Whether shape, pose or motion changed in this tick.
     pub(crate) changed: bool,
     /// Whether the shape's numbers are valid.
@@ -158,6 +162,8 @@ impl Motion {
             rotation: rotation.as_dquat().normalize(),
             velocity: DVec3::ZERO,
             spin: DVec3::ZERO,
+            of: None,
+            friction: None,
             #[cfg(feature = "avian")]
             rigid: None,
             changed: true,
@@ -171,19 +177,36 @@ impl Motion {
         shape: Arc<dyn modal::ObstacleShape>,
         pose: Pose,
         [velocity, spin]: [DVec3; 2],
-        rigid: Option<Entity>,
+        [of, rigid]: [Option<Entity>; 2],
+        friction: Option<f64>,
         awake: bool,
         last: Option<&Self>,
     ) -> Self {
         let (position, rotation) = (pose.origin, pose.orientation);
         let (shape, scale) = (Shape::Made { shape, unit: 1.0 }, DVec3::ONE);
-        let now =
-            Self { shape, scale, position, rotation, velocity, spin, rigid, changed: true, sound: true };
+        let now = Self {
+            shape,
+            scale,
+            position,
+            rotation,
+            velocity,
+            spin,
+            of,
+            rigid,
+            friction,
+            changed: true,
+            sound: true,
+        };
         // What moves is passed on anew at each step, so that the bodies near it stay awake with it.
         let same =
             |last: &Self| Self { changed: last.changed, sound: last.sound, ..now.clone() } == *last && !awake;
         let changed = last.is_none_or(|last| !same(last));
         Self { changed, sound: last.is_none_or(|last| last.sound), ..now }
+    }
+
+    /// Whether it belongs to one of these rigid bodies.
+    pub(crate) fn belongs(&self, rigids: &[Entity]) -> bool {
+        self.of.is_some_and(|of| rigids.contains(&of))
     }
 
     /// Continues the motion of `last` over a step (s).
@@ -250,7 +273,11 @@ impl Motion {
 
     /// The obstacle in the world of a body on an entity of uniform scale `scale`.
     pub(crate) fn obstacle(&self, scale: f64) -> Arc<dyn modal::ObstacleShape> {
-        self.visit(scale, Share)
+        let shape = self.visit(scale, Share);
+        match self.friction {
+            Some(friction) => Arc::new(Rough { shape, friction }),
+            None => shape,
+        }
     }
 
     /// Speed of the obstacle's material at a point, m/s, in the same world.
@@ -304,6 +331,41 @@ pub(crate) struct Nothing;
 impl modal::ObstacleShape for Nothing {
     fn at(&self, _: &Vector3<f64>) -> modal::SurfacePoint {
         modal::SurfacePoint { distance: FAR, normal: Vector3::y() }
+    }
+}
+
+/// A shape with a friction of its own.
+#[derive(Debug)]
+struct Rough {
+    shape: Arc<dyn modal::ObstacleShape>,
+    friction: f64,
+}
+
+impl modal::ObstacleShape for Rough {
+    fn at(&self, point: &Vector3<f64>) -> modal::SurfacePoint {
+        self.shape.at(point)
+    }
+
+    fn velocity(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.shape.velocity(point)
+    }
+
+    fn curvature(&self) -> f64 {
+        self.shape.curvature()
+    }
+
+    fn friction(&self) -> Option<f64> {
+        Some(self.friction)
+    }
+
+    fn check(&self) -> Result<(), modal::StepError> {
+        // The same range as that of a body.
+        modal::Contacts::default().set_friction(self.friction)?;
+        self.shape.check()
+    }
+
+    fn rigid(&self) -> Option<[u64; 2]> {
+        self.shape.rigid()
     }
 }
 
@@ -389,7 +451,7 @@ pub(crate) fn move_obstacles(
     mut made: Made,
     mut commands: Commands,
     transforms: TransformHelper,
-    mut obstacles: Query<(Entity, &Obstacle, Option<&mut Motion>)>,
+    mut obstacles: Query<(Entity, &Obstacle, Option<&BodyFriction>, Option<&mut Motion>)>,
     #[cfg(not(feature = "avian"))] gone: Query<Entity, (With<Motion>, Without<Obstacle>)>,
     #[cfg(feature = "avian")] gone: Query<Entity, crate::avian::Gone>,
 ) {
@@ -400,7 +462,7 @@ pub(crate) fn move_obstacles(
     #[cfg(feature = "mesh")]
     made.tidy();
     made.refused.retain(|entity| obstacles.contains(*entity));
-    for (entity, shape, motion) in &mut obstacles {
+    for (entity, shape, friction, motion) in &mut obstacles {
         // `GlobalTransform` is that of the last frame.
         let global = transforms.compute_global_transform(entity).ok();
         let found = |scale| match made.find(shape, scale) {
@@ -422,6 +484,9 @@ pub(crate) fn move_obstacles(
             }
         };
         let mut now = global.and_then(|global| Motion::new(shape, &global, motion.as_deref(), found));
+        if let Some(now) = &mut now {
+            now.friction = friction.map(|friction| friction.0);
+        }
         if let (Some(now), Some(last)) = (&mut now, &motion) {
             *now = now.clone().after(last, step);
         }

@@ -1,6 +1,8 @@
 //! A cube on obstacles in an app without a renderer, against what mechanics says.
 
 #[cfg(feature = "avian")]
+mod attachment;
+#[cfg(feature = "avian")]
 mod avian;
 #[cfg(feature = "mesh")]
 mod mesh;
@@ -10,6 +12,7 @@ use std::sync::{Arc, LazyLock};
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
 use pliant_body::{
     BodyRefused, BodyState, FixedObstacles, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin,
+    ProbeState, TouchProbe,
 };
 use pliant_modal::{FixedObstacle, FixedShape, ModalModel};
 
@@ -153,6 +156,65 @@ fn what_shares_no_layer_does_not_touch() {
     let on = spawn(&mut app, Transform::from_xyz(1.0, 0.3, 0.0), other);
     seconds(&mut app, 1.0);
     assert!(center(&app, through).y < -1.0 && center(&app, on).y > 0.09);
+}
+
+/// A slope of 30 degrees, whose tangent is 0.577.
+#[test]
+fn on_ice_a_body_slides_and_on_rubber_it_sticks() {
+    for (own, floor, slides) in
+        [(0.5, None, true), (0.8, None, false), (0.5, Some(1.2), false), (0.8, Some(0.1), true)]
+    {
+        let mut app = app();
+        let turn = Quat::from_rotation_z(-std::f32::consts::FRAC_PI_6);
+        let ground = app.world_mut().spawn((Obstacle::Floor, Transform::from_rotation(turn))).id();
+        if let Some(floor) = floor {
+            app.world_mut().entity_mut(ground).insert(BodyFriction(floor));
+        }
+        let at = Transform::from_translation(turn * Vec3::new(0.0, 0.1, 0.0)).with_rotation(turn);
+        let body = spawn(&mut app, at, BodyFriction(own));
+        seconds(&mut app, 1.0);
+        let (before, speed) = (center(&app, body), state(&app, body).body().frame().velocity());
+        seconds(&mut app, 1.0);
+        let way = (center(&app, body) - before).length();
+        let mu = floor.map_or(own, |floor: f64| (own * floor).sqrt());
+        assert_eq!(way > 0.02, slides, "{own} {floor:?}: {way} m");
+        if slides {
+            let gained = DVec3::from(state(&app, body).body().frame().velocity()) - DVec3::from(speed);
+            let want = GRAVITY * (0.5 - mu * 0.75f64.sqrt());
+            assert!((gained.length() / want - 1.0).abs() < 0.02, "{own} {floor:?}: {gained} for {want}");
+        }
+    }
+    let mut app = app();
+    app.world_mut().spawn((Obstacle::Floor, BodyFriction(f64::NAN)));
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.2, 0.0), ());
+    seconds(&mut app, 0.5);
+    assert!(center(&app, body).y < 0.0, "what is refused is not touched");
+    assert_eq!(app.world().resource::<Received>().refused.len(), 1);
+}
+
+#[test]
+fn a_probe_touches_what_shares_its_layers() {
+    let (all, apart) = (ContactLayers::default(), ContactLayers { memberships: 2, filters: 2 });
+    for (layers, touches) in [(all, true), (apart, false)] {
+        let mut app = app();
+        let others = ContactLayers { memberships: 1, filters: 1 };
+        app.world_mut().spawn((Obstacle::Floor, others));
+        spawn(&mut app, Transform::from_xyz(1.0, 0.5 * EDGE as f32, 0.0), others);
+        let probe = |at: DVec3| (TouchProbe { radius: 0.01, target: at, ..default() }, layers);
+        let probes = [DVec3::new(0.0, 0.02, 0.0), DVec3::new(1.0, EDGE + 0.02, 0.0)]
+            .map(|at| app.world_mut().spawn(probe(at)).id());
+        seconds(&mut app, 2.0);
+        for _ in 0..15 {
+            for mut probe in app.world_mut().query::<&mut TouchProbe>().iter_mut(app.world_mut()) {
+                probe.target.y -= 1e-3;
+            }
+            app.update();
+        }
+        for probe in probes {
+            let force = app.world().get::<ProbeState>(probe).unwrap().force().y;
+            assert_eq!(force > 0.1, touches, "{layers:?}: {force} N");
+        }
+    }
 }
 
 #[test]

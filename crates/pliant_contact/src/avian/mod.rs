@@ -18,9 +18,9 @@ use avian3d::{
     parry::shape::SharedShape,
     prelude::{
         AngularVelocity, Collider, ColliderDisabled, ColliderOf, ColliderTransform, Collisions,
-        ComputedAngularInertia, ComputedCenterOfMass, ComputedMass, ContactGraph, Gravity, GravityScale,
-        LinearVelocity, LockedAxes, Physics, PhysicsTime, Position, RigidBody, RigidBodyColliders,
-        RigidBodyDisabled, Rotation, Sensor, Sleeping,
+        ComputedAngularInertia, ComputedCenterOfMass, ComputedMass, ContactGraph, Friction, Gravity,
+        GravityScale, LinearVelocity, LockedAxes, Physics, PhysicsTime, Position, RigidBody,
+        RigidBodyColliders, RigidBodyDisabled, Rotation, Sensor, Sleeping,
     },
 };
 use bevy::{
@@ -30,14 +30,17 @@ use bevy::{
 };
 use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused, BodyState, ModalBody, PliantSystems, Pose, RigidBodies};
-use pliant_modal::{ObstacleShape, Rigid, StepError, Support, SurfacePoint};
+use pliant_modal::{Contacts, ObstacleShape, Rigid, StepError, Support, SurfacePoint};
 
 use crate::{
     contacts::{BodyContacts, Nearby, place_obstacles, publish, touch_bodies},
     obstacle::{Motion, Obstacle, keep, move_obstacles},
 };
 
+mod attachment;
 mod shape;
+
+pub use attachment::{Attachment, AttachmentForce};
 
 /// Farthest place of a collider, m. Avian marks a place that it does not know yet by the largest
 /// number.
@@ -78,6 +81,10 @@ impl<O: ObstacleShape> ObstacleShape for Owned<O> {
 
     fn curvature(&self) -> f64 {
         self.shape.curvature()
+    }
+
+    fn friction(&self) -> Option<f64> {
+        self.shape.friction()
     }
 
     fn check(&self) -> Result<(), StepError> {
@@ -130,18 +137,21 @@ pub(crate) struct Body {
     center: &'static ComputedCenterOfMass,
     gravity: Option<&'static GravityScale>,
     locked: Option<&'static LockedAxes>,
+    friction: Option<&'static Friction>,
     colliders: Option<&'static RigidBodyColliders>,
     sleeps: Has<Sleeping>,
     disabled: Has<RigidBodyDisabled>,
 }
 
 impl BodyItem<'_, '_> {
+    /// Whether avian knows where it is.
+    fn is_placed(&self) -> bool {
+        is_place(self.position.0) && self.rotation.0.is_finite()
+    }
+
     /// Whether forces move it.
     fn gives_way(&self) -> bool {
-        let numbers = is_place(self.position.0)
-            && self.rotation.0.is_finite()
-            && self.velocity.0.is_finite()
-            && self.spin.0.is_finite();
+        let numbers = self.is_placed() && self.velocity.0.is_finite() && self.spin.0.is_finite();
         self.kind.is_dynamic() && !self.disabled && numbers && self.mass.inverse() > 0.0
     }
 
@@ -223,6 +233,7 @@ type Colliders<'w, 's> = Query<
         Option<&'static ColliderTransform>,
         Has<Sensor>,
         Has<ColliderDisabled>,
+        Option<&'static Friction>,
         Option<&'static mut Motion>,
     ),
     (Without<Obstacle>, Without<ModalBody>),
@@ -242,7 +253,9 @@ fn move_colliders(
     let step = if stands { 0.0 } else { time.delta_secs_f64() };
     forms.tidy();
     refused.retain(|entity| colliders.contains(*entity));
-    for (entity, collider, position, rotation, of, local, sensor, disabled, motion) in &mut colliders {
+    for (entity, collider, position, rotation, of, local, sensor, disabled, friction, motion) in
+        &mut colliders
+    {
         let body = of.and_then(|of| bodies.get(of.body).ok());
         let (position, rotation) = match (&body, local) {
             // The place of a collider on a child is a tick old.
@@ -283,7 +296,12 @@ fn move_colliders(
             let gives_way = body.as_ref().filter(|body| body.gives_way() && step > 0.0);
             let rigid = gives_way.map(|body| body.entity);
             let awake = gives_way.is_some_and(|body| !body.sleeps);
-            Motion::of_collider(form, pose, ways, rigid, awake, motion.as_deref())
+            let of = [body.as_ref().map(|body| body.entity), rigid];
+            let on_body = body.as_ref().and_then(|body| body.friction);
+            let friction = friction
+                .or(on_body)
+                .map(|friction| f64::from(friction.dynamic_coefficient).clamp(0.0, Contacts::MAX_FRICTION));
+            Motion::of_collider(form, pose, ways, of, friction, awake, motion.as_deref())
         });
         keep(&mut commands, entity, motion, now);
     }
@@ -292,6 +310,7 @@ fn move_colliders(
 /// Adds the systems.
 pub(crate) fn build(app: &mut App, schedule: InternedScheduleLabel) {
     let running = |time: Res<Time>| !time.delta().is_zero();
+    app.register_type::<Attachment>().register_type::<AttachmentForce>().add_observer(attachment::detach);
     app.init_resource::<Forms>().init_resource::<RigidBodies>();
     app.init_resource::<Places>().init_resource::<Asleep>().add_systems(
         schedule,
@@ -301,9 +320,11 @@ pub(crate) fn build(app: &mut App, schedule: InternedScheduleLabel) {
                 .after(move_obstacles)
                 .before(place_obstacles)
                 .run_if(running),
+            attachment::attach.after(move_colliders).before(place_obstacles).run_if(running),
             gather.after(place_obstacles).after(touch_bodies).before(PliantSystems::Step).run_if(running),
             push.after(PliantSystems::Step).before(PliantSystems::Publish).run_if(running),
             wake.after(publish).run_if(running),
+            attachment::write_forces.in_set(PliantSystems::Publish),
         )
             .run_if(present),
     );
@@ -343,6 +364,7 @@ fn gather(
     let mut found: BTreeSet<(u64, Entity)> = BTreeSet::new();
     for (state, nearby) in soft.iter().filter(|(state, _)| !state.is_resting()) {
         let near = nearby.slots.iter().flatten().filter_map(|entity| motions.get(*entity).ok()?.rigid);
+        let near = near.chain(attachment::giving_way(nearby, &bodies));
         found.extend(near.map(|rigid| (state.scale().to_bits(), rigid)));
     }
     // The nearest come first.
@@ -493,15 +515,16 @@ fn wake(
     list: Res<RigidBodies>,
     sleepers: Query<Body, With<Sleeping>>,
     colliders: Query<&ColliderOf>,
-    contacts: Query<&BodyContacts>,
+    contacts: Query<(&BodyContacts, &Nearby)>,
 ) {
     asleep.0.retain(|entity, _| sleepers.contains(*entity));
     if asleep.0.is_empty() {
         return;
     }
-    let touched = contacts.iter().flat_map(|contacts| &contacts.0);
+    let touched = contacts.iter().flat_map(|(contacts, _)| &contacts.0);
     let mut held: BTreeSet<Entity> =
         touched.filter_map(|contact| colliders.get(contact.other).ok()).map(|of| of.body).collect();
+    held.extend(contacts.iter().flat_map(|(_, nearby)| &nearby.attached));
     held.extend(list.0.iter().filter_map(|rigid| Entity::try_from_bits(rigid.key[0])));
     asleep.0.retain(|entity, last| {
         let stays = *last == [DVec3::ZERO; 2] || held.contains(entity);

@@ -7,35 +7,35 @@ use pliant_body::RigidBodies;
 use super::*;
 use crate::obstacle::Motion;
 
-fn avian(gravity: f32) -> App {
+pub(super) fn avian(gravity: f32) -> App {
     app_with(|app| {
         app.add_plugins(PhysicsPlugins::default()).insert_resource(Gravity(gravity * Vec3::NEG_Y));
     })
 }
 
-fn earth() -> App {
+pub(super) fn earth() -> App {
     avian(GRAVITY as f32)
 }
 
 /// A box of this mass.
-fn brick(app: &mut App, at: Vec3, size: Vec3, mass: f64) -> Entity {
+pub(super) fn brick(app: &mut App, at: Vec3, size: Vec3, mass: f64) -> Entity {
     let density = mass as f32 / (size.x * size.y * size.z);
     let collider = (Collider::cuboid(size.x, size.y, size.z), ColliderDensity(density));
     app.world_mut().spawn((RigidBody::Dynamic, collider, Transform::from_translation(at))).id()
 }
 
 /// A soft cube without weight of its own.
-fn weightless(app: &mut App, at: Vec3) -> Entity {
+pub(super) fn weightless(app: &mut App, at: Vec3) -> Entity {
     let model = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(CUBE.clone()));
     let body = ModalBody::new(model);
     app.world_mut().spawn((body, Transform::from_translation(at))).id()
 }
 
-fn place(app: &App, rigid: Entity) -> DVec3 {
+pub(super) fn place(app: &App, rigid: Entity) -> DVec3 {
     app.world().get::<Position>(rigid).unwrap().0.as_dvec3()
 }
 
-fn velocity(app: &App, rigid: Entity) -> DVec3 {
+pub(super) fn velocity(app: &App, rigid: Entity) -> DVec3 {
     app.world().get::<LinearVelocity>(rigid).unwrap().0.as_dvec3()
 }
 
@@ -51,7 +51,7 @@ fn throw(app: &mut App, body: Entity, velocity: [f64; 3]) {
 }
 
 /// Momentum (N s) and angular momentum about the origin (N m s) of a rigid body.
-fn momentum(app: &App, rigid: Entity) -> [DVec3; 2] {
+pub(super) fn momentum(app: &App, rigid: Entity) -> [DVec3; 2] {
     let get = app.world().entity(rigid);
     let mass = f64::from(get.get::<ComputedMass>().unwrap().value());
     let turn = get.get::<Rotation>().unwrap().0;
@@ -61,7 +61,7 @@ fn momentum(app: &App, rigid: Entity) -> [DVec3; 2] {
     [linear, (Mat3::from(inertia) * spin).as_dvec3() + place(app, rigid).cross(linear)]
 }
 
-fn soft_momentum(app: &App, body: Entity) -> [DVec3; 2] {
+pub(super) fn soft_momentum(app: &App, body: Entity) -> [DVec3; 2] {
     let frame = state(app, body).body().frame();
     let linear = CUBE.mass() * DVec3::from(frame.velocity());
     [linear, DVec3::from(frame.spin()) + DVec3::from(frame.center()).cross(linear)]
