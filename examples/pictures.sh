@@ -102,6 +102,7 @@ picture free_bodies free_bodies
 picture falling falling
 picture pile pile
 picture from_blender from_blender
+picture mobile mobile
 picture walk walk
 picture touch touch
 picture feel feel
