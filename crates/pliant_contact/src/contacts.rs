@@ -113,8 +113,8 @@ pub struct ContactEnded {
 pub(crate) struct Nearby {
     #[entities]
     pub(crate) slots: Vec<Option<Entity>>,
-    /// The rigid bodies to which the body is attached, which it does not touch.
-    #[entities]
+    /// The rigid bodies to which the body is attached, which it does not touch. Found at each tick.
+    #[reflect(ignore)]
     pub(crate) attached: Vec<Entity>,
     /// The friction that was refused, so that it is reported once.
     refused: Option<f64>,
