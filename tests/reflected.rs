@@ -169,8 +169,8 @@ macro_rules! import {
 }
 
 import! {
-    BodyContacts, BodyFriction, BodyGravity, BodyGravityScale, BodyReady, BodyRefused, BodyState, ContactEnded,
-    ContactLayers, ContactPlugin, ContactStarted, Driven, ForceArrow, Grab,
+    Attachment, AttachmentForce, BodyContacts, BodyFriction, BodyGravity, BodyGravityScale, BodyReady,
+    BodyRefused, BodyState, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Driven, ForceArrow, Grab,
     GrabForce, GrabOf, Grabbed, Grabs, HapticButton, HapticDevices,
     HapticFault, HapticNotice, HapticTool, HapticsPlugin, Impulse, Inertia,
     Integrator, ModalAsset, ModalBody, ModalModel, NoPointerGrab, Obstacle,
