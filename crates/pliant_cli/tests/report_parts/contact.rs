@@ -13,8 +13,9 @@ fn known_answers_of_contact_are_met() {
         let [want, got, off, allowed] = [3, 4, 5, 6].map(number);
         let share = if want == 0.0 { got.abs() } else { (got / want - 1.0).abs() };
         assert!(off <= allowed, "{row:?}");
-        // What the row says is what its numbers are. They have five decimals.
-        let rounding = 1e-3 + if want == 0.0 { 1e-3 } else { 1e-3 / want.abs() };
+        // What the row says is what its numbers are. They have five decimals, and this one three
+        // digits.
+        let rounding = 1e-3 + if want == 0.0 { 1e-3 } else { 1e-3 / want.abs() } + 6e-3 * off;
         assert!((100.0 * share - off).abs() <= rounding, "{row:?}");
         assert!(number(7) > 0.0, "{row:?}");
     }
