@@ -246,11 +246,11 @@ impl ContactPoint {
 
     /// Work that the step may do to take back what is amiss at its beginning, J.
     pub(crate) fn recovery(&self) -> f64 {
-        let out = match &self.attached {
-            Some(at) => self.pushed.dot(&(at.left - at.apart)),
-            None => self.pushed[0] * (self.floor - self.gap),
-        };
-        out.max(0.0)
+        match &self.attached {
+            Some(at) => self.pushed.dot(&(at.left - at.apart)).max(0.0),
+            // With a normal that has turned, a force may come to point into the surface.
+            None => self.pushed[0] * (self.floor - self.gap).max(0.0),
+        }
     }
 
     /// The sites that carry the point, with their weights.
