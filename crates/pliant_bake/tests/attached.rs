@@ -505,3 +505,36 @@ fn what_hangs_from_what_holds_or_lets_go() {
     println!("{holding} of 54 hold");
     assert!(failed.is_empty() && holding >= 28, "{holding}, {failed:?}");
 }
+
+#[test]
+fn points_out_of_this_world_leave_a_body_that_steps_on() {
+    for held in [true, false] {
+        let model = bar(YOUNG, held, 0.02);
+        let patch = face(&model, true);
+        for far in [1e3, 1e9, 1e150, 1e300] {
+            for (distance, speed) in [(far, 0.0), (0.0, far), (far, -far)] {
+                let mut body = body(&model, GRAVITY, 1.0 / 60.0);
+                // One patch is pulled to both sides.
+                for side in [1.0, -1.0] {
+                    let point = [LENGTH, side * distance, 0.0];
+                    let to = AttachedTo::World { point, velocity: [side * speed, 0.0, speed] };
+                    body.attach(&patch, to).unwrap();
+                }
+                let mut islands = Islands::default();
+                for _ in 0..30 {
+                    let mut all = [Together::new(1, &mut body)];
+                    islands.step_with(&mut all, &mut [], 1.0 / 60.0, |_, _| true, |_, _| true);
+                    // A step that has no finite result is an error, and the body stays as it was.
+                    let error = &all[0].error;
+                    let diverged = matches!(error, Some(StepError::Diverged { .. }));
+                    assert!(error.is_none() || (far > 1e9 && diverged), "{far:.0e}: {error:?}");
+                    let center = body.frame().center();
+                    let moved = Vector3::from(center).norm();
+                    let case = format!("held {held}, {distance:.0e} m, {speed:.0e} m/s");
+                    assert!(moved < 10.0, "{case}: center at {center:?}");
+                    assert!(body.energy().is_finite(), "{case}: {}", body.energy());
+                }
+            }
+        }
+    }
+}

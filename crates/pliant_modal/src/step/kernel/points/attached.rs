@@ -101,11 +101,13 @@ fn share(inverse: &Matrix3<f64>, pulls: impl Iterator<Item = (f64, Vector3<f64>)
     if most > 1.0 { 1.0 / most } else { 1.0 }
 }
 
+/// Finds the shares of the torques that turn the bodies.
+///
 /// Pulls `F` at arms `r` hold a body that turns about an axis `n` by the stiffness
-/// `k = sum |F| |r x n|` at most. A force
-/// that acts at the beginning of the step is stable with it up to `h^2 k / I = 4`, with the inertia
-/// `I`. A small body between heavy ones counts as one of as much more inertia (M. Tournier et al.,
-/// *Stable constrained dynamics*, 2015): a share of the torque turns it.
+/// `k = sum |F| |r x n|` at most. A force that acts at the beginning of the step is stable with it
+/// up to `h^2 k / I = 4`, with the inertia `I`. A small body between heavy ones counts as one of as
+/// much more inertia (M. Tournier et al., *Stable constrained dynamics*, 2015): a share of the
+/// torque turns it.
 fn share_torques<P: Member>(group: &Group<'_, P>, points: &mut [ContactPoint]) {
     let h = group.h;
     for number in 0..points.len() {
