@@ -1,13 +1,15 @@
-//! A device's ball presses and strokes Pip, without gripping, and rolls off onto the floor.
+//! A device's ball, finger or box presses and strokes Pip, without gripping, and slides off onto
+//! the floor.
 //!
-//! What to learn here: [`ToolTouch`] on a tool gives it a ball. The ball touches every body and,
-//! with the contact plugin, every [`Obstacle`]; the device's loop closes the contact 1,000 times a
-//! second. [`ProbeState`] tells where the ball is and what it touches. A [`ToolGrip`] beside it
-//! grips while the button is down.
+//! What to learn here: [`ToolTouch`] on a tool gives it a ball, and [`ProbeShape`] beside it another
+//! shape. It touches every body and, with the contact plugin, every [`Obstacle`]; the device's loop
+//! closes the contact 1,000 times a second. [`ProbeState`] tells where the tool is, how it is turned
+//! and what it touches. A [`ToolGrip`] beside it grips while the button is down.
 //!
 //! ```sh
 //! cargo run --release --example touch                   # the mouse is the hand; the force is shown
 //! cargo run --release --example touch -- --device auto  # what is plugged in, at a tenth of its force
+//! cargo run --release --example touch -- --tool finger  # a capsule; or a box
 //! cargo run --release --example touch -- --headless     # a simulated device in a simulated hand
 //! ```
 
@@ -18,7 +20,7 @@ mod stage;
 use std::error::Error;
 
 use bevy::{math::DVec3, prelude::*};
-use clap::Parser;
+use clap::{Parser, ValueEnum};
 use pliant::{
     haptics::{
         DeviceId, ForceArrow, GamepadSource, HapticDevice, HapticDevices, HapticSystems, HapticTool,
@@ -33,16 +35,33 @@ use stage::{Readout, Stage, Unattended};
 /// Ticks of the simulation per second.
 const RATE: f64 = 120.0;
 
-/// Radius of the ball, m.
+/// Radius of the ball, and of the rounding of the other shapes, m.
 const RADIUS: f64 = 0.012;
 
-/// A device's ball presses and strokes Pip.
+/// The end of the finger, from its tip on, and half of the edges of the box without its rounding,
+/// m.
+const FINGER: DVec3 = DVec3::new(0.0, 0.04, 0.03);
+const HALF: DVec3 = DVec3::new(0.02, 0.004, 0.01);
+
+/// What a tool touches with.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+enum Tip {
+    Ball,
+    Finger,
+    Box,
+}
+
+/// A device's ball, finger or box presses and strokes Pip.
 #[derive(Parser, Debug)]
 struct Arguments {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// The device that holds the ball. Default: the mouse; without a window, the simulated device.
+    /// What touches.
+    #[arg(long, value_enum, default_value_t = Tip::Ball)]
+    tool: Tip,
+
+    /// The device that holds the tool. Default: the mouse; without a window, the simulated device.
     #[arg(long, value_enum)]
     device: Option<Kind>,
 
@@ -57,11 +76,12 @@ struct Scene {
     mover: Mover,
     kind: Kind,
     force_scale: f64,
+    tip: Tip,
 }
 
-/// The picture of the ball.
+/// The picture of the tool.
 #[derive(Component)]
-struct Ball;
+struct Drawn;
 
 fn main() -> AppExit {
     match run(Arguments::parse()) {
@@ -85,7 +105,7 @@ fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
     let config = device::loop_config(&device, false, picture);
     let id = app.world_mut().resource_mut::<HapticDevices>().add(device, config)?;
     app.insert_resource(Time::<Fixed>::from_hz(RATE))
-        .insert_resource(Scene { device: id, mover, kind, force_scale })
+        .insert_resource(Scene { device: id, mover, kind, force_scale, tip: options.tool })
         .add_systems(Startup, place)
         .add_systems(FixedUpdate, play.before(HapticSystems::Move))
         .add_systems(Update, (hold_out, draw, write));
@@ -109,15 +129,30 @@ fn place(
         })),
     ));
     commands.spawn(Obstacle::Floor);
+    let radius = RADIUS as f32;
+    let (mesh, at) = match scene.tip {
+        Tip::Ball => (meshes.add(Sphere::new(radius)), Transform::IDENTITY),
+        Tip::Finger => {
+            let axis = FINGER.as_vec3();
+            let turn = Quat::from_rotation_arc(Vec3::Y, axis.normalize());
+            let mesh = meshes.add(Capsule3d::new(radius, axis.length()));
+            (mesh, Transform::from_translation(0.5 * axis).with_rotation(turn))
+        }
+        Tip::Box => {
+            (meshes.add(Cuboid::from_size(2.0 * (HALF.as_vec3() + Vec3::splat(radius)))), Transform::IDENTITY)
+        }
+    };
+    let material = materials.add(StandardMaterial {
+        base_color: Color::srgb(0.35, 0.55, 0.85),
+        perceptual_roughness: 0.3,
+        ..default()
+    });
+    let away = Transform::from_xyz(0.0, -1.0, 0.0);
     commands.spawn((
-        Ball,
-        Mesh3d(meshes.add(Sphere::new(RADIUS as f32))),
-        MeshMaterial3d(materials.add(StandardMaterial {
-            base_color: Color::srgb(0.35, 0.55, 0.85),
-            perceptual_roughness: 0.3,
-            ..default()
-        })),
-        Transform::from_xyz(0.0, -1.0, 0.0),
+        Drawn,
+        away,
+        Visibility::default(),
+        children![(Mesh3d(mesh), MeshMaterial3d(material), at)],
     ));
     // If the mouse is not the device, it can grab bodies directly.
     pointer.enabled = scene.kind != Kind::Pointer;
@@ -132,11 +167,17 @@ fn hold_out(
     let Ok((state, place)) = bodies.single() else { return };
     let positions = state.model().surface().positions();
     let Some(top) = positions.iter().max_by(|a, b| a[1].total_cmp(&b[1])) else { return };
-    let above = place.transform_point(Vec3::from(*top)) + Vec3::Y * (RADIUS as f32 + 0.02);
+    let (shape, low) = match scene.tip {
+        Tip::Ball => (ProbeShape::default(), 0.0),
+        Tip::Finger => (ProbeShape::capsule(DVec3::ZERO, FINGER), 0.0),
+        Tip::Box => (ProbeShape::cuboid(HALF), HALF.y),
+    };
+    let above = place.transform_point(Vec3::from(*top)) + Vec3::Y * ((RADIUS + low) as f32 + 0.02);
     let mut tool = commands.spawn((
         Name::new("tool"),
         HapticTool { force_scale: scene.force_scale, ..HapticTool::new(scene.device) },
         ToolTouch { radius: RADIUS, ..default() },
+        shape,
         ToolGrip::default(),
         ForceArrow { radius: 0.3 * RADIUS as f32, ..default() },
         Transform::from_translation(above),
@@ -167,16 +208,17 @@ fn play(
     hand.set_target((side - down * DVec3::Y).into());
 }
 
-/// Draws the ball where it is, and not where the hand is.
+/// Draws the tool where it is, and not where the hand is.
 fn draw(
-    mut balls: Query<&mut Transform, With<Ball>>,
+    mut drawn: Query<&mut Transform, With<Drawn>>,
     tools: Query<(&ToolPose, &ProbeState)>,
     mut gizmos: Gizmos,
 ) {
     let Ok((pose, probe)) = tools.single() else { return };
     let at = probe.position().unwrap_or(pose.position).as_vec3();
-    for mut ball in &mut balls {
-        ball.translation = at;
+    for mut drawn in &mut drawn {
+        drawn.translation = at;
+        drawn.rotation = probe.rotation().unwrap_or(pose.orientation).as_quat();
     }
     gizmos.line(at, pose.position.as_vec3(), Color::srgb(0.98, 0.86, 0.25));
 }
@@ -197,7 +239,7 @@ fn write(
         "{}: {:?}\n\
          coupling     {:6.0} N/m\n\
          touches      {touched} ({sliding} slide), at most {}\n\
-         on the ball  {:6.2} N, at most {:.2} N\n\
+         on the tool  {:6.2} N, at most {:.2} N, {:.1} mN m\n\
          in the hand  {:6.2} N\n\
          stretch      {:6.2} mm",
         status.info.name,
@@ -206,6 +248,7 @@ fn write(
         most.0,
         probe.force().length(),
         most.1,
+        1e3 * probe.torque().length(),
         pose.force.length(),
         1e3 * deep,
     );

@@ -169,8 +169,8 @@ pub mod prelude {
     pub use crate::body::{
         BodyGravity, BodyGravityScale, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf,
         Grabbed, Grabs, Impulse, Inertia, Integrator, ModalAsset, ModalBody, NoPointerGrab, PliantBodyPlugin,
-        PliantDisplaySystems, PliantSystems, PliantTick, ProbeState, Push, Relaxation, Released, RideOn,
-        RidingPlugin, SingleSteps, StepSettings, SurfaceAnchor, SurfacePlace, Teleport, TouchProbe,
+        PliantDisplaySystems, PliantSystems, PliantTick, ProbeShape, ProbeState, Push, Relaxation, Released,
+        RideOn, RidingPlugin, SingleSteps, StepSettings, SurfaceAnchor, SurfacePlace, Teleport, TouchProbe,
         VisualState,
     };
     #[cfg(feature = "render")]

@@ -10,9 +10,9 @@ use pliant_modal::{
     Touched,
 };
 
-const STIFFNESS: f64 = 500.0;
+pub(crate) const STIFFNESS: f64 = 500.0;
 
-fn model(mesh: &TetMesh, young: f64, anchor: Option<&str>) -> Arc<ModalModel> {
+pub(crate) fn model(mesh: &TetMesh, young: f64, anchor: Option<&str>) -> Arc<ModalModel> {
     let config = BakeConfig {
         modes: 30,
         young,
@@ -26,21 +26,21 @@ fn model(mesh: &TetMesh, young: f64, anchor: Option<&str>) -> Arc<ModalModel> {
 }
 
 /// A cube of 0.1 m that stands on its fixed bottom.
-fn block(young: f64) -> Arc<ModalModel> {
+pub(crate) fn block(young: f64) -> Arc<ModalModel> {
     model(&shapes::cube(6, 0.1).unwrap(), young, Some("y<0.001"))
 }
 
-fn body(model: &Arc<ModalModel>, rate: f64) -> Body {
+pub(crate) fn body(model: &Arc<ModalModel>, rate: f64) -> Body {
     let config = BodyConfig { step: 1.0 / rate, ..BodyConfig::from(StepSettings::default()) };
     Body::new(model.clone(), config).unwrap()
 }
 
-fn probe(radius: f64, target: Vector3<f64>) -> Probe {
+pub(crate) fn probe(radius: f64, target: Vector3<f64>) -> Probe {
     let config = ProbeConfig { radius, stiffness: STIFFNESS, relaxation: 2e-3, friction: 0.5 };
     Probe::new(config, target.into()).unwrap()
 }
 
-fn step(islands: &mut Islands, bodies: &mut [Body], probes: &mut [Probe], rate: f64) {
+pub(crate) fn step(islands: &mut Islands, bodies: &mut [Body], probes: &mut [Probe], rate: f64) {
     let mut all: Vec<Together<'_>> =
         bodies.iter_mut().enumerate().map(|(key, body)| Together::new(key as u64, body)).collect();
     islands.step_with(&mut all, probes, 1.0 / rate, |_, _| true, |_, _| true);
@@ -48,12 +48,12 @@ fn step(islands: &mut Islands, bodies: &mut [Body], probes: &mut [Probe], rate: 
     assert!(errors.is_empty(), "{errors:?}");
 }
 
-fn top(model: &ModalModel) -> Vector3<f64> {
+pub(crate) fn top(model: &ModalModel) -> Vector3<f64> {
     let [low, high] = model.surface().bounds().map(|at| Vector3::from(at.map(f64::from)));
     Vector3::new(0.5 * (low.x + high.x), high.y, 0.5 * (low.z + high.z))
 }
 
-fn force(probe: &Probe) -> Vector3<f64> {
+pub(crate) fn force(probe: &Probe) -> Vector3<f64> {
     probe.force().into()
 }
 

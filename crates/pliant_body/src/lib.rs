@@ -105,7 +105,7 @@ pub use pick::{SurfaceHit, pick_surface};
 pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSettings};
 #[cfg(feature = "picking")]
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
-pub use probe::{ProbeState, TouchProbe, Touching};
+pub use probe::{ProbeShape, ProbeState, TouchProbe, Touching};
 pub use ride_on::RideOn;
 pub use riding::RidingPlugin;
 pub use saved::SavedState;
@@ -232,6 +232,7 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<Impulse>()
             .register_type::<Push>()
             .register_type::<TouchProbe>()
+            .register_type::<ProbeShape>()
             .add_message::<SingleSteps>()
             .add_message::<Impulse>()
             .add_message::<Push>()

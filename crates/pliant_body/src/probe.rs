@@ -1,31 +1,38 @@
-//! Probes: balls that press and stroke bodies without gripping.
+//! Probes: tools that press and stroke bodies without gripping.
 
 use std::sync::Arc;
 
-use bevy::{math::DVec3, prelude::*};
+use bevy::{
+    math::{DQuat, DVec3},
+    prelude::*,
+};
 use pliant_modal::{Contacts, ObstacleShape, Probe, ProbeConfig, ProbeContact, StepError, Touched};
 
-/// A ball that a hand holds by a spring, and that presses and strokes every body here
-/// ([`Driven::Local`](crate::Driven::Local)) and, with the contact plugin, every obstacle.
+/// A tool that a hand holds by a spring, and that presses and strokes every body here
+/// ([`Driven::Local`](crate::Driven::Local)) and, with the contact plugin, every obstacle. It is a
+/// ball, or what its [`ProbeShape`] says.
 ///
-/// The ball stays on the surface while its target goes in. It touches bodies of one scale at a
+/// The probe stays on the surface while its target goes in. It touches bodies of one scale at a
 /// time: that of the body whose center is nearest. What it touches is in [`ProbeState`].
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Debug, Clone, PartialEq)]
-#[require(ProbeState)]
+#[require(ProbeState, ProbeShape)]
 pub struct TouchProbe {
-    /// Radius of the ball, m, above 0. Default: `0.01`.
+    /// Radius of the ball, or by which the shape is rounded, m, above 0. Default: `0.01`.
     pub radius: f64,
-    /// Where the spring pulls the center of the ball, m, world axes.
+    /// Where the spring pulls the tool point, the center of a ball, m, world axes.
     pub target: DVec3,
-    /// Stiffness of the spring, N/m, above 0. Default: `500`.
+    /// To where the spring turns the probe, from own to world axes. Default: not turned.
+    pub rotation: DQuat,
+    /// Stiffness of the spring, N/m, above 0. Against a turn it is this times the square of the
+    /// farthest corner's distance from the tool point. Default: `500`.
     pub stiffness: f64,
     /// Relaxation time of the damper beside the spring, s, 0 or more. Default: `0.001`.
     pub relaxation: f64,
     /// Coefficient of friction, 0 to 10. At a body, and at an obstacle that has one of its
     /// own, the geometric mean of both counts. Default: `0.5`.
     pub friction: f64,
-    /// Whether the ball touches anything. Default: `true`.
+    /// Whether the probe touches anything. Default: `true`.
     pub enabled: bool,
 }
 
@@ -34,11 +41,41 @@ impl Default for TouchProbe {
         Self {
             radius: 0.01,
             target: DVec3::ZERO,
+            rotation: DQuat::IDENTITY,
             stiffness: 500.0,
             relaxation: 1e-3,
             friction: Contacts::FRICTION,
             enabled: true,
         }
+    }
+}
+
+/// Shape of a [`TouchProbe`]: the convex hull of some points, rounded by the radius of the probe.
+/// Default: one point, a ball.
+#[derive(Component, Reflect, Debug, Clone, PartialEq)]
+#[reflect(Component, Default, Debug, Clone, PartialEq)]
+pub struct ProbeShape {
+    /// The points, m from the tool point, axes of the probe, 1 to [`Probe::MAX_CORNERS`].
+    pub corners: Vec<DVec3>,
+}
+
+impl Default for ProbeShape {
+    fn default() -> Self {
+        Self { corners: vec![DVec3::ZERO] }
+    }
+}
+
+impl ProbeShape {
+    /// A capsule between two points, m from the tool point, axes of the probe.
+    pub fn capsule(from: DVec3, to: DVec3) -> Self {
+        Self { corners: vec![from, to] }
+    }
+
+    /// A box around the tool point. `half` has half of its edges without the rounding, m.
+    pub fn cuboid(half: DVec3) -> Self {
+        let sign = |bit: usize, number: usize| if number >> bit & 1 == 0 { -1.0 } else { 1.0 };
+        let corner = |number| half * DVec3::new(sign(0, number), sign(1, number), sign(2, number));
+        Self { corners: (0..8).map(corner).collect() }
     }
 }
 
@@ -57,7 +94,10 @@ pub struct Touching {
     pub compliance: [[f64; 3]; 3],
     /// Coefficient of friction.
     pub friction: f64,
-    /// Mean force on the ball over the last step, N, world axes. Zero where nothing touches.
+    /// The place of the probe: the center of the sphere that touches there, m from the tool point,
+    /// axes of the probe. Zero of a ball.
+    pub spot: DVec3,
+    /// Mean force on the probe over the last step, N, world axes. Zero where nothing touches.
     pub force: DVec3,
     /// Whether the contact slides.
     pub sliding: bool,
@@ -83,17 +123,29 @@ impl Default for ProbeState {
 }
 
 impl ProbeState {
-    /// Center of the ball, m, world axes. `None` while the probe touches nothing.
+    /// Position of the tool point, the center of a ball, m, world axes. `None` while the probe is
+    /// not enabled, or was refused.
     pub fn position(&self) -> Option<DVec3> {
         Some(DVec3::from(self.probe.as_ref()?.position()) * self.scale)
     }
 
-    /// Force on the ball over the last step, N, world axes.
+    /// Rotation from own to world axes. `None` as [`position`](Self::position).
+    pub fn rotation(&self) -> Option<DQuat> {
+        Some(DQuat::from_array(self.probe.as_ref()?.rotation()))
+    }
+
+    /// Force on the probe over the last step, N, world axes.
     pub fn force(&self) -> DVec3 {
         self.probe.as_ref().map_or(DVec3::ZERO, |probe| DVec3::from(probe.force()) * self.scale)
     }
 
-    /// What the ball touches, and what is near it.
+    /// Torque of the force about the tool point, N m, world axes. Zero of a ball.
+    pub fn torque(&self) -> DVec3 {
+        let square = self.scale * self.scale;
+        self.probe.as_ref().map_or(DVec3::ZERO, |probe| DVec3::from(probe.torque()) * square)
+    }
+
+    /// What the probe touches, and what is near it.
     pub fn contacts(&self) -> impl Iterator<Item = Touching> + '_ {
         let scale = self.scale;
         let contacts = self.probe.as_ref().map_or(&[][..], Probe::contacts);
@@ -111,10 +163,16 @@ impl ProbeState {
                 // Lengths and forces have the same factor.
                 compliance: contact.compliance,
                 friction: contact.friction,
+                spot: DVec3::from(contact.spot) * scale,
                 force: DVec3::from(contact.force) * scale,
                 sliding: contact.sliding,
             })
         })
+    }
+
+    /// Distance of the farthest point of the shape from the tool point, m.
+    pub fn extent(&self) -> f64 {
+        self.probe.as_ref().map_or(0.0, |probe| probe.extent() * self.scale)
     }
 
     /// Center (m, world axes) around which obstacles count, and the scale of their shapes.
@@ -122,12 +180,12 @@ impl ProbeState {
         Some((self.position()?, self.scale))
     }
 
-    /// The obstacles that the ball was given.
+    /// The obstacles that the probe was given.
     pub fn obstacles(&self) -> &[Entity] {
         &self.obstacles
     }
 
-    /// Gives the ball its obstacles, in lengths of [`around`](Self::around)'s scale.
+    /// Gives the probe its obstacles, in lengths of [`around`](Self::around)'s scale.
     ///
     /// # Errors
     /// Returns the error of [`Probe::set_obstacles`]. The old obstacles then stay.
@@ -157,7 +215,12 @@ impl ProbeState {
     }
 
     /// Takes the probe for a step, led to its target.
-    pub(crate) fn take(&mut self, wanted: &TouchProbe, scale: f64) -> Result<Option<Probe>, StepError> {
+    pub(crate) fn take(
+        &mut self,
+        wanted: &TouchProbe,
+        shape: &ProbeShape,
+        scale: f64,
+    ) -> Result<Option<Probe>, StepError> {
         if !wanted.enabled {
             (self.probe, self.refused) = (None, false);
             self.obstacles.clear();
@@ -171,15 +234,17 @@ impl ProbeState {
         };
         let target = (wanted.target / scale).into();
         let known = self.probe.take().filter(|_| self.scale == scale);
-        let taken = match known {
-            Some(mut probe) => {
-                probe.configure(config).and_then(|()| probe.set_target(target)).map(|()| probe)
-            }
-            None => {
-                self.obstacles.clear();
-                Probe::new(config, target)
-            }
-        };
+        if known.is_none() {
+            self.obstacles.clear();
+        }
+        let corners: Vec<[f64; 3]> = shape.corners.iter().map(|corner| (*corner / scale).into()).collect();
+        let taken = known.map_or_else(|| Probe::new(config, target), Ok).and_then(|mut probe| {
+            probe.configure(config)?;
+            probe.set_target(target)?;
+            probe.set_rotation(wanted.rotation.to_array())?;
+            probe.set_corners(&corners)?;
+            Ok(probe)
+        });
         self.scale = scale;
         let first = !std::mem::replace(&mut self.refused, taken.is_err());
         match taken {

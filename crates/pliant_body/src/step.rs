@@ -19,8 +19,8 @@ use pliant_modal::{
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed,
-    Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, ProbeState, Released, STEP_TIME, SavedState,
-    TouchProbe, VisualState, body::HeldBody, gravity::Pull,
+    Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, ProbeShape, ProbeState, Released, STEP_TIME,
+    SavedState, TouchProbe, VisualState, body::HeldBody, gravity::Pull,
 };
 
 /// The tick: the number of steps that the schedule of the bodies has made.
@@ -349,12 +349,12 @@ pub(crate) fn step_bodies(
     mut islands: Local<Islands>,
     mut rigids: Option<ResMut<RigidBodies>>,
     mut bodies: Query<(NameOrEntity, &ModalBody, &Driven, &mut BodyState)>,
-    mut probes: Query<(NameOrEntity, &TouchProbe, &mut ProbeState)>,
+    mut probes: Query<(NameOrEntity, &TouchProbe, &ProbeShape, &mut ProbeState)>,
 ) {
     let start = Instant::now();
     let step = time.delta_secs_f64();
     let mut all: Vec<_> = Vec::new();
-    let probed = probes.iter().any(|(_, probe, _)| probe.enabled);
+    let probed = probes.iter().any(|(_, probe, ..)| probe.enabled);
     let pushes = rigids.as_ref().is_some_and(|rigids| !rigids.0.is_empty());
     for (name, body, driven, mut state) in &mut bodies {
         // A resting body takes part only where others may wake it.
@@ -478,12 +478,12 @@ fn meet(own: [u32; 2], other: [u32; 2]) -> bool {
 /// Takes the probes for a step: the entity of each, the scale of the bodies that it touches and its
 /// layers, and the probes.
 fn take_probes(
-    probes: &mut Query<(NameOrEntity, &TouchProbe, &mut ProbeState)>,
+    probes: &mut Query<(NameOrEntity, &TouchProbe, &ProbeShape, &mut ProbeState)>,
     bodies: &[(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)],
     refusals: &mut Refusals,
 ) -> (Vec<(Entity, f64, [u32; 2])>, Vec<Probe>) {
     let (mut held, mut taken) = (Vec::new(), Vec::new());
-    for (name, wanted, mut state) in probes {
+    for (name, wanted, shape, mut state) in probes {
         let away = |state: &BodyState| {
             (DVec3::from(state.body.frame().center()) * state.scale).distance_squared(wanted.target)
         };
@@ -491,7 +491,7 @@ fn take_probes(
             meet(state.layers(), body.probe_layers)
         };
         let nearest = bodies.iter().filter(touched).min_by(|a, b| away(&a.2).total_cmp(&away(&b.2)));
-        match state.take(wanted, nearest.map_or(1.0, |(.., state)| state.scale)) {
+        match state.take(wanted, shape, nearest.map_or(1.0, |(.., state)| state.scale)) {
             Ok(Some(probe)) => {
                 held.push((name.entity, state.scale(), state.layers()));
                 taken.push(probe);

@@ -295,7 +295,7 @@ fn give_probe(
 ) -> Result<(), StepError> {
     state.set_layers([layers.memberships, layers.filters]);
     let Some((center, scale)) = state.around() else { return Ok(()) };
-    let reach = NEAR + 3.0 * probe.radius + 2.0 * center.distance(probe.target);
+    let reach = NEAR + 2.0 * probe.radius + state.extent() + 2.0 * center.distance(probe.target);
     let local = Vector3::from((center / scale).to_array());
     let near: Vec<(Entity, &Motion)> = all
         .iter()

@@ -89,6 +89,7 @@ impl World {
             let seen = *self.cycle.core().last();
             if seen.now > 0.0 {
                 self.probe.set_target(seen.tool).unwrap();
+                self.probe.set_rotation(seen.tool_orientation).unwrap();
             }
             let mut bodies: Vec<_> = self.body.iter_mut().map(|body| Together::new(7, body)).collect();
             let probes = std::slice::from_mut(&mut self.probe);
@@ -99,9 +100,11 @@ impl World {
                 radius: config.radius,
                 stiffness: config.stiffness,
                 relaxation: config.relaxation,
+                lever: self.probe.extent() - config.radius,
             };
             let planes = self.probe.contacts().iter().map(|c| TouchPlane {
                 key: 7,
+                spot: c.spot,
                 point: c.point,
                 normal: c.normal,
                 velocity: c.velocity,
@@ -164,13 +167,52 @@ fn on_a_rigid_floor_the_hand_feels_the_coupling_spring() {
     }
 }
 
+/// A capsule whose axis is tilted in the hand touches with its lower end and then lies down. The
+/// loop's force and torque are those of its two springs.
+#[test]
+fn a_capsule_lies_down_in_the_loop_too() {
+    let (half, tilt) = (0.02, 0.1_f64);
+    let end = [half * tilt.cos(), half * tilt.sin(), 0.0];
+    let mut seen = Vec::new();
+    for sunk in [0.0005, 0.006] {
+        let mut world = World::new(None, 60.0, VirtualConfig::premium(), HandModel::FIRM);
+        world.probe.set_corners(&[end.map(|x| -x), end]).unwrap();
+        let down = [0.0, -GAP + end[1] - sunk, 0.0];
+        world.lead(UP, down, 0.5, |_| {});
+        world.lead(down, down, 2.0, |_| {});
+        let spring = world.probe.config().stiffness;
+        let (force, tool) = (world.force()[1], world.tool()[1]);
+        let torque = world.cycle.core().last().wrench.torque[2];
+        // The lower end, with its turn: `F = k (r + l sin a - y)`, `a = tilt - F cos a / (k l)`.
+        let (mut low, mut high) = (0.0, spring * 0.1);
+        for _ in 0..100 {
+            let f: f64 = 0.5 * (low + high);
+            let a = (0..200).fold(tilt, |a: f64, _| tilt - f * a.cos() / (spring * half));
+            if tool + f / spring < RADIUS + half * a.sin() { low = f } else { high = f }
+        }
+        let a = (0..200).fold(tilt, |a: f64, _| tilt - low * a.cos() / (spring * half));
+        // Or both ends, with the whole turn undone.
+        let (want, turned) = if a > 0.0 { (low, tilt - a) } else { (spring * (RADIUS - tool), tilt) };
+        let pull = -spring * half * half * turned;
+        println!("{force:.4} N of {want:.4}, {torque:.6} N m of {pull:.6}, {turned:.4} of {tilt} rad");
+        assert!(want > 0.1 && (force / want - 1.0).abs() < 0.02, "{force} {want}");
+        assert!((torque / pull - 1.0).abs() < 0.02, "{torque} {pull}");
+        seen.push(turned < tilt);
+    }
+    assert_eq!(seen, [true, false], "one end, and both");
+}
+
+/// A tool's corners: none for a ball, or those of a capsule.
+const TOOLS: [&[[f64; 3]]; 2] = [&[[0.0; 3]], &[[-0.015, 0.004, 0.0], [0.02, 0.0, 0.01]]];
+
 #[test]
 fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
-    for young in [2e4, 1e5, 1e6] {
+    for (young, corners) in [2e4, 1e5, 1e6].into_iter().flat_map(|young| TOOLS.map(|tool| (young, tool))) {
         for simulation in [30.0, 60.0, 120.0, 240.0] {
             for hand in [HandModel::LIGHT, HandModel::FIRM] {
                 let mut world = World::new(Some(young), simulation, VirtualConfig::touch(), hand);
-                let name = format!("E {young:.0e}, {simulation} Hz, {hand:?}");
+                world.probe.set_corners(corners).unwrap();
+                let name = format!("E {young:.0e}, {} corners, {simulation} Hz, {hand:?}", corners.len());
                 world.lead(UP, UP, 0.5, |world| assert_eq!(world.force(), [0.0; 3], "{name}"));
                 let mut pulled = 0.0f64;
                 let mut most = 0.0f64;
@@ -211,10 +253,11 @@ fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
 
 #[test]
 fn a_hand_that_rests_on_a_body_is_calm() {
-    for young in [2e4, 1e5, 1e6] {
+    for (young, corners) in [2e4, 1e5, 1e6].into_iter().flat_map(|young| TOOLS.map(|tool| (young, tool))) {
         for simulation in [30.0, 60.0, 120.0, 240.0] {
             for hand in [HandModel::LIGHT, HandModel::FIRM] {
                 let mut world = World::new(Some(young), simulation, VirtualConfig::touch(), hand);
+                world.probe.set_corners(corners).unwrap();
                 world.lead(UP, DOWN, 0.5, |_| {});
                 world.lead(DOWN, DOWN, 3.0, |_| {});
                 let mut fastest = 0.0f64;
@@ -223,7 +266,8 @@ fn a_hand_that_rests_on_a_body_is_calm() {
                     fastest = fastest.max(v.iter().map(|v| v * v).sum::<f64>().sqrt());
                 });
                 println!(
-                    "E {young:.0e}, {simulation} Hz, {hand:?}: {:.2} mm/s, {:?} N",
+                    "E {young:.0e}, {} corners, {simulation} Hz, {hand:?}: {:.2} mm/s, {:?} N",
+                    corners.len(),
                     1e3 * fastest,
                     world.force()
                 );

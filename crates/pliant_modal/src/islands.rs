@@ -310,7 +310,7 @@ impl Islands {
             let mut near = std::mem::take(&mut probe.near);
             near.clear();
             for ball in self.balls.iter().filter(|ball| ball.step == h && may_probe(number, ball.index)) {
-                let reach = way + probe.config().radius;
+                let reach = way + probe.extent();
                 let body = &mut *bodies[ball.index].body;
                 let own =
                     ball.step * (ball.velocity.norm() + body.speed_bound()) + MARGIN * body.model().size();

@@ -30,25 +30,48 @@ const fn inverse_factorials(first: usize) -> [f64; TERMS] {
 /// `A = sum (-s)^k / (2k + 2)!`, `B = sum (-s)^k / (2k + 3)!`.
 const COEFFICIENTS: [[f64; TERMS]; 2] = [inverse_factorials(2), inverse_factorials(3)];
 
+/// Bound of `s` below which the series count.
+const SMALL: f64 = 0.5;
+
 /// Returns `A(s)`, `B(s)` and their derivatives with respect to `s = |w|^2`.
 pub(crate) fn coefficients(s: f64) -> [f64; 4] {
-    if s < 0.5 {
-        // Horner's rule for the values and the derivatives together.
-        let [mut a, mut b, mut da, mut db] = [0.0; 4];
-        for (of_a, of_b) in COEFFICIENTS[0].iter().zip(&COEFFICIENTS[1]).rev() {
-            (da, db) = (-a - s * da, -b - s * db);
-            (a, b) = (of_a - s * a, of_b - s * b);
+    if s < SMALL { series(&[s]).map(|[x]| x) } else { closed(s) }
+}
+
+/// As [`coefficients`], for several numbers side by side.
+#[inline(always)]
+pub(crate) fn coefficients_of<const N: usize>(s: &[f64; N]) -> [[f64; N]; 4] {
+    let mut all = series(s);
+    for (i, s) in s.iter().enumerate() {
+        // A number that is none has closed forms that are none.
+        if s.is_nan() || *s >= SMALL {
+            all.iter_mut().zip(closed(*s)).for_each(|(all, one)| all[i] = one);
         }
-        [a, b, da, db]
-    } else {
-        let t = s.sqrt();
-        let (sin, cos) = t.sin_cos();
-        let a = (1.0 - cos) / s;
-        let b = (t - sin) / (s * t);
-        let da = (t * sin - 2.0 * (1.0 - cos)) / (2.0 * s * s);
-        let db = (t * (1.0 - cos) - 3.0 * (t - sin)) / (2.0 * s * s * t);
-        [a, b, da, db]
     }
+    all
+}
+
+/// Horner's rule for the values and the derivatives together.
+#[inline(always)]
+fn series<const N: usize>(s: &[f64; N]) -> [[f64; N]; 4] {
+    let [mut a, mut b, mut da, mut db] = [[0.0; N]; 4];
+    for (of_a, of_b) in COEFFICIENTS[0].iter().zip(&COEFFICIENTS[1]).rev() {
+        for i in 0..N {
+            (da[i], db[i]) = (-a[i] - s[i] * da[i], -b[i] - s[i] * db[i]);
+            (a[i], b[i]) = (of_a - s[i] * a[i], of_b - s[i] * b[i]);
+        }
+    }
+    [a, b, da, db]
+}
+
+fn closed(s: f64) -> [f64; 4] {
+    let t = s.sqrt();
+    let (sin, cos) = t.sin_cos();
+    let a = (1.0 - cos) / s;
+    let b = (t - sin) / (s * t);
+    let da = (t * sin - 2.0 * (1.0 - cos)) / (2.0 * s * s);
+    let db = (t * (1.0 - cos) - 3.0 * (t - sin)) / (2.0 * s * s * t);
+    [a, b, da, db]
 }
 
 /// Returns the warped displacement `R~(w) d` (m) of a node with rotation vector `w` (rad) and

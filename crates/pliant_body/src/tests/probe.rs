@@ -3,7 +3,7 @@
 use bevy::{math::DVec3, prelude::*};
 
 use super::{STEP, app, model, refusals, spawn, state, steps};
-use crate::{ProbeState, TouchProbe};
+use crate::{ProbeShape, ProbeState, TouchProbe};
 
 /// A probe above the middle of a free bar at some scale, and the two entities.
 fn above(scale: f32) -> (App, Entity, Entity, DVec3) {
@@ -43,6 +43,36 @@ fn a_body_takes_the_momentum_of_a_probe_at_every_scale() {
         assert!(given.y < 0.0, "it was pushed down: {given}");
         assert!((got - given).length() < 1e-9 * given.length(), "{scale}: {got} {given}");
         assert_eq!(refusals(&mut app), []);
+    }
+}
+
+#[test]
+fn a_shaped_probe_turns_as_its_spring_lets_it_at_every_scale() {
+    for scale in [1.0, 2.5] {
+        let (mut app, _, probe, start) = above(scale);
+        // A ball on an arm beside the tool point.
+        let TouchProbe { radius, stiffness, .. } = *app.world().get::<TouchProbe>(probe).unwrap();
+        let arm = 2.0 * radius;
+        app.world_mut().entity_mut(probe).insert(ProbeShape { corners: vec![DVec3::X * arm] });
+        for step in 1..=30 {
+            lead(
+                &mut app,
+                probe,
+                start - DVec3::X * arm - DVec3::Y * radius * (1.0 + 0.01 * f64::from(step)),
+            );
+        }
+        let state = app.world().get::<ProbeState>(probe).unwrap();
+        let (axis, angle) = state.rotation().unwrap().to_axis_angle();
+        let want = stiffness * arm * arm * angle * axis;
+        assert!(state.force().y > 0.0 && state.torque().z > 0.0, "{:?} {:?}", state.force(), state.torque());
+        let off = (state.torque() - want).length() / want.length();
+        assert!(off < 0.05, "{scale}: {} {want}", state.torque());
+        // A shape without a point touches nothing, and that is told.
+        app.world_mut().entity_mut(probe).insert(ProbeShape { corners: Vec::new() });
+        steps(&mut app, 2);
+        assert_eq!(force(&app, probe), DVec3::ZERO);
+        let received = refusals(&mut app);
+        assert!(matches!(&received[..], [(entity, _)] if *entity == probe), "told once: {received:?}");
     }
 }
 

@@ -338,7 +338,13 @@ impl LoopCore {
             // In free air the energy of the port begins anew.
             holding = self.touch.touches();
             let stored = touched.stored + model.stored;
-            PatchForces { elastic: touched.elastic, damping: touched.damping, stored, ..forces }
+            PatchForces {
+                elastic: touched.elastic,
+                damping: touched.damping,
+                torque: touched.torque,
+                stored,
+                ..forces
+            }
         } else {
             self.touch.rest();
             forces
@@ -423,7 +429,7 @@ impl LoopCore {
         supplied
     }
 
-    /// Returns the torque of the held patches, reduced as the force was: by `share`, the part of
+    /// Returns the torque of what the tool holds or touches, reduced as the force was: by `share`, the part of
     /// the wanted force that was let through, and at most to `gain`. A pure couple wants no force
     /// and is reduced by `gain` alone.
     ///

@@ -32,13 +32,16 @@ pub struct ToolContact {
 }
 
 /// Maximum number of planes that a tool touches at once.
-pub const MAX_PLANES: usize = 6;
+pub const MAX_PLANES: usize = 8;
 
-/// A plane that the tool's ball touches or is near: the surface of a body or of an obstacle.
+/// A plane that a place of the tool touches or is near: the surface of a body or of an obstacle.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TouchPlane {
-    /// Key of what is touched, unique for as long as it is near.
+    /// Key of what is touched. Several places of a tool may touch the same.
     pub key: u64,
+    /// The place of the tool: the center of the sphere that touches there, m of the world from the
+    /// tool point, axes of the tool. Zero of a ball.
+    pub spot: [f64; 3],
     /// A point of the surface, m, world axes. The dent is not in it.
     pub point: [f64; 3],
     /// Outward normal, unit length, world axes.
@@ -51,14 +54,18 @@ pub struct TouchPlane {
     pub friction: f64,
 }
 
-/// The ball with which a tool touches, at the tool point.
+/// The ball with which a tool touches, or the rounding of its shape.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TouchBall {
     /// Radius, m of the world.
     pub radius: f64,
-    /// Stiffness of the spring from the tool to the ball, N/m of the world. With 0 it touches
+    /// Stiffness of the spring from the tool to what touches, N/m of the world. With 0 it touches
     /// nothing.
     pub stiffness: f64,
+    /// Distance of the farthest corner of the shape from the tool point, m of the world. The
+    /// stiffness against a turn is that of the spring times its square. Zero of a ball, which does
+    /// not turn.
+    pub lever: f64,
     /// Relaxation time of the damper beside the spring, s.
     pub relaxation: f64,
 }
@@ -81,7 +88,7 @@ pub struct LocalModel {
     pub contacts: [ToolContact; MAX_CONTACTS],
     /// Number of grabs that the tool holds.
     pub count: usize,
-    /// The tool's ball, and the planes that it may touch. The first `plane_count` are in use.
+    /// The tool's ball or rounding, and the planes that it may touch. The first `plane_count` are in use.
     pub ball: TouchBall,
     /// See [`ball`](Self::ball).
     pub planes: [TouchPlane; MAX_PLANES],
@@ -121,10 +128,10 @@ impl LocalModel {
     /// Returns whether no scalar and no contact in use contains a NaN or an infinity.
     pub fn is_finite(&self) -> bool {
         let scalars = [self.stamp, self.period, self.interval, self.stored, self.supplied];
-        let ball = [self.ball.radius, self.ball.stiffness, self.ball.relaxation];
+        let ball = [self.ball.radius, self.ball.stiffness, self.ball.relaxation, self.ball.lever];
         scalars.iter().chain(&ball).all(|x| x.is_finite())
             && self.planes().iter().all(|p| {
-                let vectors = [p.point, p.normal, p.velocity];
+                let vectors = [p.point, p.normal, p.velocity, p.spot];
                 let upright = (Vector3::from(p.normal).norm() - 1.0).abs() < 1e-6;
                 upright
                     && p.friction >= 0.0

@@ -1,12 +1,13 @@
-//! Contact at device rate: the planes that the tool's ball touches.
+//! Contact at device rate: the planes that the tool touches.
 //!
-//! The simulation publishes what its own ball touches and what is near it as planes
-//! ([`TouchPlane`]). The loop holds a ball of its own by the same spring and solves the same law of
-//! contact with these planes in every period, as [`pliant_modal::Probe`] does once a step. So the
+//! The simulation publishes what its own probe touches and what is near it as planes
+//! ([`TouchPlane`]), each with the place of the probe. The loop holds a probe of its own by the same
+//! spring and solves the same law of contact with these planes in every period, as
+//! [`pliant_modal::Probe`] does once a step. So the
 //! force is there when the hand meets a surface and gone when it leaves, whatever the rate of the
 //! simulation, and it never pulls.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use pliant_modal::contact_force;
 
 use crate::{LocalModel, MAX_PLANES, TouchPlane, control_loop::tool::Tool};
@@ -22,6 +23,8 @@ const SWEEPS: usize = 12;
 pub(crate) struct TouchForces {
     pub(crate) elastic: Vector3<f64>,
     pub(crate) damping: Vector3<f64>,
+    /// Torque of both about the tool point, N m.
+    pub(crate) torque: Vector3<f64>,
     /// Energy in the spring and the dents, J.
     pub(crate) stored: f64,
 }
@@ -33,14 +36,62 @@ struct TouchSlot {
     /// Height by which the plane lies behind the received one, m, and how fast this decays, m/s.
     lag: f64,
     rate: f64,
-    /// Where the ball's center sticks, m. Set while the plane is touched.
+    /// Where the center of the sphere sticks, m. Set while the plane is touched.
     anchor: Option<Vector3<f64>>,
-    /// Force on the ball: along the normal and two tangents, N.
+    /// Force on the tool: along the normal and two tangents, N.
     force: Vector3<f64>,
 }
 
+/// The tool in a period.
+#[derive(Debug, Clone, Copy)]
+struct Held {
+    position: Vector3<f64>,
+    orientation: UnitQuaternion<f64>,
+    radius: f64,
+    /// Way for a force, m/N, and turn for a torque, rad/(N m).
+    soft: f64,
+    turning: f64,
+}
+
+/// Sum of the forces on the tool, N, and of their torques about the tool point, N m.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sum {
+    force: Vector3<f64>,
+    torque: Vector3<f64>,
+}
+
+impl Sum {
+    fn add(&mut self, force: &Vector3<f64>, arm: &Vector3<f64>) {
+        self.force += force;
+        self.torque += arm.cross(force);
+    }
+}
+
+impl Held {
+    /// Center of the sphere at a place of the tool where the hand has it, m, world axes.
+    fn center(&self, plane: &TouchPlane) -> Vector3<f64> {
+        self.position + self.orientation * Vector3::from(plane.spot)
+    }
+
+    /// From the tool point to where the plane touches, m, world axes.
+    fn arm(&self, plane: &TouchPlane) -> Vector3<f64> {
+        self.orientation * Vector3::from(plane.spot) - self.radius * Vector3::from(plane.normal)
+    }
+
+    /// Displacement by the spring's give at an arm, m.
+    fn give(&self, sum: &Sum, arm: &Vector3<f64>) -> Vector3<f64> {
+        sum.force * self.soft + (sum.torque * self.turning).cross(arm)
+    }
+
+    /// Displacement at an arm for a force there, m/N, world axes.
+    fn response(&self, arm: &Vector3<f64>) -> Matrix3<f64> {
+        let turns = Matrix3::identity() * arm.norm_squared() - arm * arm.transpose();
+        Matrix3::identity() * self.soft + turns * self.turning
+    }
+}
+
 impl TouchSlot {
-    /// Distance of the ball to the received plane after `age` seconds, m.
+    /// Distance of a sphere to the received plane after `age` seconds, m.
     fn gap(&self, center: &Vector3<f64>, radius: f64, age: f64) -> f64 {
         let at = Vector3::from(self.plane.point) + Vector3::from(self.plane.velocity) * age;
         Vector3::from(self.plane.normal).dot(&(center - at)) - radius
@@ -59,7 +110,7 @@ impl TouchSlot {
     }
 }
 
-/// The contact of a tool's ball with the planes of the local model.
+/// The contact of a tool with the planes of the local model.
 #[derive(Debug, Default)]
 pub(crate) struct Touch {
     slots: [TouchSlot; MAX_PLANES],
@@ -67,6 +118,8 @@ pub(crate) struct Touch {
     tick: u64,
     since: f64,
     touches: bool,
+    /// Orientation of the tool in the last period.
+    orientation: UnitQuaternion<f64>,
 }
 
 impl Touch {
@@ -75,70 +128,82 @@ impl Touch {
         *self = Self::default();
     }
 
-    /// Whether a plane pushed the ball in the last period.
+    /// Whether a plane pushed the tool in the last period.
     pub(crate) fn touches(&self) -> bool {
         self.touches
     }
 
     /// Takes the planes of a new update. A plane that is touched goes on where it was, and from
-    /// there to where the update has it. Another plane in which the ball already is begins at the
-    /// ball, without force.
-    fn take(&mut self, now: f64, age: f64, model: &LocalModel, center: &Vector3<f64>) {
-        let radius = model.ball.radius;
+    /// there to where the update has it. Another plane in which the tool already is begins at the
+    /// tool, without force.
+    fn take(&mut self, now: f64, age: f64, model: &LocalModel, held: &Held) {
         let (old, known) = (self.slots, self.count);
         (self.tick, self.since) = (model.tick, now);
         self.count = model.planes().len();
         let interval = interval(model).max(1e-3);
         for (slot, plane) in self.slots.iter_mut().zip(model.planes()) {
-            let last = old[..known].iter().find(|slot| slot.plane.key == plane.key);
+            let last = same(&old[..known], model.planes(), plane);
             let touched = last.filter(|slot| slot.force.x > 0.0);
             *slot = TouchSlot { plane: *plane, ..touched.copied().unwrap_or_default() };
-            let gap = slot.gap(center, radius, 0.0);
+            let center = held.center(plane);
+            let gap = slot.gap(&center, held.radius, 0.0);
             slot.lag = match touched {
-                Some(last) => last.gap(center, radius, age) + last.lag - gap,
+                Some(last) => last.gap(&held.center(&last.plane), held.radius, age) + last.lag - gap,
                 None => (-gap).max(0.0),
             };
             slot.rate = slot.lag.abs() / interval;
-            // The force keeps its direction in the world.
+            // The force keeps its direction in the world, and what sticks its way from the tool.
             slot.force =
                 touched.map_or_else(Vector3::zeros, |last| slot.axes() * last.axes().tr_mul(&last.force));
+            if let (Some(anchor), Some(last)) = (&mut slot.anchor, touched) {
+                *anchor += center - held.center(&last.plane);
+            }
         }
     }
 
-    /// Returns the forces of this tick on the ball of a tool at its present pose.
+    /// Returns the forces of this tick on a tool at its present pose.
     ///
-    /// The ball's center is at `x + sum f / k` for a tool at `x` and the forces `f` of the planes,
-    /// and each force obeys the law of contact with the dent of its plane.
+    /// The tool point is at `x + sum f / k` for a tool at `x` and the forces `f` of the planes, and
+    /// the torque of these turns the tool against `k l^2`. Each force obeys the law of contact with
+    /// the dent of its plane.
     pub(crate) fn forces(&mut self, now: f64, dt: f64, tool: &Tool, model: &LocalModel) -> TouchForces {
-        let (center, ball) = (tool.position, &model.ball);
+        let ball = &model.ball;
+        let soft = if ball.stiffness > 0.0 { 1.0 / ball.stiffness } else { 0.0 };
+        let turning = if ball.lever > 0.0 { soft / (ball.lever * ball.lever) } else { 0.0 };
+        let (position, orientation) = (tool.position, tool.orientation);
+        let held = Held { position, orientation, radius: ball.radius, soft, turning };
         let age = |now: f64, since: f64| (now - since).clamp(0.0, interval(model));
         if model.tick != self.tick {
-            self.take(now, age(now, self.since), model, &center);
+            self.take(now, age(now, self.since), model, &held);
         }
         let age = age(now, self.since);
+        let turned = orientation * std::mem::replace(&mut self.orientation, orientation).inverse();
         let mut out = TouchForces::default();
         self.touches = false;
-        if tool.is_clutched() || self.count == 0 || ball.stiffness <= 0.0 {
+        if tool.is_clutched() || self.count == 0 || soft <= 0.0 {
             self.slots.iter_mut().for_each(|slot| (slot.anchor, slot.force) = (None, Vector3::zeros()));
             return out;
         }
-        let soft = 1.0 / ball.stiffness;
         let slots = &mut self.slots[..self.count];
-        let mut total = Vector3::zeros();
+        let mut total = Sum::default();
         for slot in &mut *slots {
             slot.lag -= slot.lag.clamp(-slot.rate * dt, slot.rate * dt);
             if let Some(anchor) = &mut slot.anchor {
                 *anchor += Vector3::from(slot.plane.velocity) * dt;
+                // A tool that turns takes what touches along, but not the center of its sphere.
+                let below = -held.radius * Vector3::from(slot.plane.normal);
+                *anchor -= turned * below - below;
             }
-            total += slot.axes().tr_mul(&slot.force);
+            total.add(&slot.axes().tr_mul(&slot.force), &held.arm(&slot.plane));
         }
         for _ in 0..SWEEPS {
             let mut moved = 0.0f64;
             for slot in &mut *slots {
-                let axes = slot.axes();
-                let response = axes * slot.compliance() * axes.transpose() + Matrix3::identity() * soft;
-                let others = total - axes.tr_mul(&slot.force);
-                let free_center = center + others * soft;
+                let (axes, arm, center) = (slot.axes(), held.arm(&slot.plane), held.center(&slot.plane));
+                let response = axes * (slot.compliance() + held.response(&arm)) * axes.transpose();
+                let mut others = total;
+                others.add(&-axes.tr_mul(&slot.force), &arm);
+                let free_center = center + held.give(&others, &arm);
                 let gap = slot.gap(&free_center, ball.radius, age) + slot.lag;
                 let anchor = slot.anchor.unwrap_or(center);
                 let along = axes * (free_center - anchor);
@@ -146,25 +211,26 @@ impl Touch {
                 let (force, _) = contact_force(&response, &free, slot.plane.friction, &slot.force);
                 moved = moved.max((force - slot.force).norm());
                 slot.force = force;
-                total = others + axes.tr_mul(&force);
+                total = others;
+                total.add(&axes.tr_mul(&force), &arm);
             }
             if moved < 1e-9 {
                 break;
             }
         }
-        let at = center + total * soft;
         for slot in slots {
             if slot.force.x <= 0.0 {
                 (slot.anchor, slot.force) = (None, Vector3::zeros());
                 continue;
             }
             self.touches = true;
-            let axes = slot.axes();
+            let (axes, arm, center) = (slot.axes(), held.arm(&slot.plane), held.center(&slot.plane));
+            let at = center + held.give(&total, &arm);
             let force = axes.tr_mul(&slot.force);
             let dent = slot.compliance() * force;
-            let held = slot.force.y.hypot(slot.force.z);
+            let across = slot.force.y.hypot(slot.force.z);
             let most = slot.plane.friction * slot.force.x;
-            let sticks = held < most * (1.0 - 1e-9);
+            let sticks = across < most * (1.0 - 1e-9);
             // A contact that slides takes its anchor along.
             slot.anchor = if sticks { slot.anchor.or(Some(center)) } else { Some(at + dent) };
             out.stored += 0.5 * force.dot(&dent);
@@ -172,7 +238,8 @@ impl Touch {
             // the spring, so that neither the first touch nor the last is an impulse, and it stays
             // in the cone.
             let normal = Vector3::from(slot.plane.normal);
-            let damping = ball.relaxation / (soft + normal.dot(&(slot.compliance() * normal)));
+            let give = (slot.compliance() + held.response(&arm)) * normal;
+            let damping = ball.relaxation / normal.dot(&give);
             let mut drag = axes * (Vector3::from(slot.plane.velocity) - tool.velocity) * damping;
             drag.x = drag.x.clamp(-slot.force.x, slot.force.x);
             let normal = slot.force.x + drag.x;
@@ -184,12 +251,29 @@ impl Touch {
             if across.norm() > most {
                 across *= most / across.norm();
             }
+            let whole = axes.tr_mul(&(across + Vector3::x() * normal));
             out.elastic += force;
-            out.damping += axes.tr_mul(&(across + Vector3::x() * normal)) - force;
+            out.damping += whole - force;
+            if turning > 0.0 {
+                // Nothing turns a ball.
+                out.torque += arm.cross(&whole);
+            }
         }
-        out.stored += 0.5 * soft * total.norm_squared();
+        out.stored += 0.5 * soft * total.force.norm_squared() + 0.5 * turning * total.torque.norm_squared();
         out
     }
+}
+
+/// The old slot of a plane: that of the same body or obstacle whose place of the tool is the nearest
+/// to that of the plane, if no other plane is nearer to it.
+fn same<'a>(old: &'a [TouchSlot], planes: &[TouchPlane], plane: &TouchPlane) -> Option<&'a TouchSlot> {
+    let apart = |a: &TouchPlane, b: &TouchPlane| (Vector3::from(a.spot) - Vector3::from(b.spot)).norm();
+    let near = |slot: &&TouchSlot| slot.plane.key == plane.key;
+    let nearest = |a: &&TouchSlot, b: &&TouchSlot| apart(&a.plane, plane).total_cmp(&apart(&b.plane, plane));
+    let slot = old.iter().filter(near).min_by(nearest)?;
+    let own = apart(&slot.plane, plane);
+    let nearer = |other: &TouchPlane| other.key == plane.key && apart(other, &slot.plane) < own;
+    (!planes.iter().any(nearer)).then_some(slot)
 }
 
 /// Time for which a plane goes on with its velocity, and in which it is corrected, s.

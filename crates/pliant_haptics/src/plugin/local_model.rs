@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use bevy::{math::DVec3, prelude::*};
 use nalgebra::Matrix3;
-use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ProbeState, TouchProbe, VisualState};
+use pliant_body::{
+    BodyState, Driven, Grab, GrabForce, GrabOf, ProbeState, TouchProbe, Touching, VisualState,
+};
 use pliant_modal::{BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
@@ -170,10 +172,18 @@ pub(crate) fn publish(
                 warn!("{}: the hand was told of no contact: {error}", entry.status.info.name);
             }
         } else if let Some((probe, state)) = touch.filter(|(probe, _)| probe.enabled) {
-            let ball =
-                TouchBall { radius: probe.radius, stiffness: probe.stiffness, relaxation: probe.relaxation };
-            let planes = state.contacts().map(|contact| TouchPlane {
+            let ball = TouchBall {
+                radius: probe.radius,
+                stiffness: probe.stiffness,
+                relaxation: probe.relaxation,
+                lever: (state.extent() - probe.radius).max(0.0),
+            };
+            // What pushes comes first, if there are more than the loop has room for.
+            let mut touched: Vec<Touching> = state.contacts().collect();
+            touched.sort_by(|a, b| b.force.length().total_cmp(&a.force.length()));
+            let planes = touched.into_iter().map(|contact| TouchPlane {
                 key: contact.other.to_bits(),
+                spot: contact.spot.into(),
                 point: contact.point.into(),
                 normal: contact.normal.into(),
                 velocity: contact.velocity.into(),

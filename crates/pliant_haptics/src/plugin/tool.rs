@@ -78,14 +78,15 @@ impl HapticTool {
     }
 }
 
-/// Lets a tool touch bodies and obstacles with a ball at the tool point while it holds nothing.
+/// Lets a tool touch bodies and obstacles with a ball at the tool point while it holds nothing, or
+/// with another shape that turns with the hand ([`ProbeShape`](pliant_body::ProbeShape)).
 ///
 /// The plugin adds a [`TouchProbe`] to the tool's entity and writes it.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 #[require(TouchProbe { enabled: false, ..default() })]
 pub struct ToolTouch {
-    /// Radius of the ball, m of the world, above 0. Default: `0.01`.
+    /// Radius of the ball or of the shape's rounding, m of the world, above 0. Default: `0.01`.
     pub radius: f64,
     /// Coefficient of friction, 0 to 10. At a body the geometric mean with that of the body counts.
     /// Default: `0.5`.
@@ -250,6 +251,7 @@ pub(crate) fn lead_balls(
         probe.set_if_neq(TouchProbe {
             radius: touch.radius,
             target: pose.position,
+            rotation: pose.orientation,
             stiffness,
             relaxation: spring.map_or(0.0, |spring| spring.relaxation),
             friction: touch.friction,

@@ -51,7 +51,7 @@ pub use rigid::{Rigid, Support};
 pub(crate) use attachment::Attachment;
 pub(crate) use indent::Indent;
 pub(crate) use point::{AtAttachment, AtProbe, AtRigid, AtSupport, ContactPoint, Far, Memory};
-pub(crate) use probe::{Grown, ProbeMemory};
+pub(crate) use probe::{Grown, ProbeMemory, Spot};
 pub(crate) use rigid::Pushed;
 pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};

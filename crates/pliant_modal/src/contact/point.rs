@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Indent, Touched,
+    Indent, Spot, Touched,
     cone::{self, Status},
     surface_field::{Carriers, Place},
 };
@@ -66,6 +66,15 @@ pub(crate) struct AtProbe {
     pub(crate) first: Option<(Place, Carriers)>,
     /// The place of the body that is nearest at the end of the step.
     pub(crate) last: Option<Place>,
+    /// The place of the probe whose material touches, and the one that is nearest at the end of the
+    /// step.
+    pub(crate) spot: Spot,
+    pub(crate) nearest: Spot,
+    /// From the tool point to where the force acts, m, world axes.
+    pub(crate) arm: Vector3<f64>,
+    /// Where the center of the sphere would be at the end of the step if it had gone as the
+    /// material that touches, m, world axes.
+    pub(crate) carried: Vector3<f64>,
     /// A point and the normal of the surface at the end of the last computed step, m, world axes.
     pub(crate) plane: [Vector3<f64>; 2],
 }
@@ -123,7 +132,7 @@ pub(crate) struct ContactPoint {
     /// The side at another body. `None` at an obstacle.
     pub(crate) far: Option<Far>,
     /// The side at a probe. The force is on the body, and at an obstacle on the probe, whose span
-    /// then is the member. The anchor is relative to the center of the ball at a body.
+    /// then is the member. The anchor is relative to the center of the sphere at a body.
     pub(crate) probe: Option<AtProbe>,
     /// The side at a rigid body to which the obstacle belongs.
     pub(crate) rigid: Option<AtRigid>,

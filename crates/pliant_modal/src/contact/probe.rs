@@ -1,21 +1,33 @@
-//! Probes: balls that a hand holds by a spring, and that press and stroke bodies.
+//! Probes: tools that a hand holds by a spring, and that press and stroke bodies.
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 use super::{ObstacleShape, Place, Touched};
 use crate::{Contacts, StepError, error::finite};
 
-/// Speed of a target above which it was moved from elsewhere, m/s.
+/// Speed of a target above which it was moved from elsewhere, m/s, and rad/s where it turns.
 const TELEPORT: f64 = 100.0;
+
+/// Largest number of places at which a probe is searched, corners and those between them, and the
+/// largest number between two corners.
+const MAX_SEEDS: usize = 64;
+const MAX_BETWEEN: usize = 8;
+
+/// Distance of two places of a probe below which they are one, as a share of the radius.
+const SAME: f64 = 0.25;
+
+/// Steps of the search for the place of a probe that is nearest to a surface.
+const SLIDES: usize = 4;
 
 /// Settings of a [`Probe`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProbeConfig {
-    /// Radius of the ball, m, above 0.
+    /// Radius of the ball, or by which the shape is rounded, m, above 0.
     pub radius: f64,
-    /// Stiffness of the spring to the target, N/m, above 0.
+    /// Stiffness of the spring to the target, N/m, above 0. That against a turn is
+    /// this times the square of the farthest corner's distance from the tool point, N m.
     pub stiffness: f64,
     /// Relaxation time of the damper beside the spring, its damping over the stiffness, s, 0 or
     /// more.
@@ -61,10 +73,33 @@ pub struct ProbeContact {
     pub compliance: [[f64; 3]; 3],
     /// Coefficient of friction.
     pub friction: f64,
+    /// Place of the probe that is nearest to the surface: the center of the sphere there, m from
+    /// the tool point, axes of the probe.
+    pub spot: [f64; 3],
     /// Force on the probe over the step, N, world axes. Zero where nothing touches.
     pub force: [f64; 3],
     /// Whether the contact slides.
     pub sliding: bool,
+}
+
+/// A place of a probe: the center of the sphere that touches there.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Spot {
+    /// Position from the tool point, m, axes of the probe.
+    pub(crate) at: Vector3<f64>,
+    /// Which of the places that stay it is: a corner, or one between two. `None` for a place that
+    /// slides over the probe.
+    pub(crate) fixed: Option<usize>,
+}
+
+impl Spot {
+    /// Whether a contact at one is a contact at the other too.
+    pub(crate) fn is_same(&self, other: &Self, radius: f64) -> bool {
+        match (self.fixed, other.fixed) {
+            (Some(one), Some(other)) => one == other,
+            _ => (self.at - other.at).norm() < SAME * radius,
+        }
+    }
 }
 
 /// A contact of the last step.
@@ -73,33 +108,53 @@ pub(crate) struct ProbeMemory {
     pub(crate) other: Touched,
     /// Force on the body, or on the probe at an obstacle, N, world axes.
     pub(crate) force: Vector3<f64>,
-    /// Where it sticks, m, world axes: the material of the place relative to the ball's center at a
-    /// body, the ball's center at an obstacle.
+    /// Where it sticks, m, world axes: the material of the place relative to the sphere's center at
+    /// a body, the sphere's center at an obstacle.
     pub(crate) anchor: Vector3<f64>,
+    /// The place of the probe.
+    pub(crate) spot: Spot,
     /// The place of the body.
     pub(crate) place: Option<Place>,
 }
 
-/// A ball that a hand holds by a spring, and that touches bodies and obstacles without gripping.
+/// A tool that a hand holds by a spring, and that touches bodies and obstacles without gripping.
 ///
-/// The spring ties the ball to its target, as the virtual coupling of a haptic device does. The
-/// ball has no mass: under the force `f` of what it touches, its center is at
+/// The tool is a ball, or the convex hull of some points, rounded by a radius
+/// ([`Probe::set_corners`]): two make a capsule, eight a box. The spring ties the tool to its
+/// target, as the virtual coupling of a haptic device does. The tool has no mass: under the force
+/// `f` of what it touches, its point is at
 ///
 /// ```text
 /// y = x* + f h / (k (h + r))        x* = target + (y_before - target_before) r / (r + h)
 /// ```
 ///
-/// with the stiffness `k`, the relaxation time `r` and the step `h`.
+/// with the stiffness `k`, the relaxation time `r` and the step `h`. In the same way the torque
+/// about that point turns it against `k l^2`, with the distance `l` of the farthest corner: a force
+/// on that corner moves it by the turn as far as by the way. A ball does not turn.
 /// [`Islands::step_with`](crate::Islands::step_with) solves this with all contacts of the step, so
-/// the forces on a body and on the probe are equal and opposite, and the ball stays on the surface
-/// while the target goes in. The ball touches each body at the place nearest to it.
+/// the forces on a body and on the probe are equal and opposite, and the probe stays on the surface
+/// while the target goes in. It touches each body and each obstacle with the corners that are near,
+/// and with the place between them that is nearest.
 #[derive(Debug, Clone)]
 pub struct Probe {
     config: ProbeConfig,
     obstacles: Vec<Arc<dyn ObstacleShape>>,
+    /// The corners, and then the places between them at which the search begins, m, own axes.
+    seeds: Vec<Vector3<f64>>,
+    corners: usize,
+    /// Distance of the farthest corner from the tool point, m. Zero of a ball.
+    lever: f64,
     target: Vector3<f64>,
     last_target: Option<Vector3<f64>>,
     pub(crate) position: Vector3<f64>,
+    /// Rotation from own to world axes: of the target, of the last one, and of the probe at the
+    /// beginning of the step, at its end without contact, and at its end.
+    turned: UnitQuaternion<f64>,
+    last_turned: UnitQuaternion<f64>,
+    start_rotation: UnitQuaternion<f64>,
+    free_rotation: UnitQuaternion<f64>,
+    rotation: UnitQuaternion<f64>,
+    torque: Vector3<f64>,
     pub(crate) contacts: Vec<ProbeContact>,
     pub(crate) memory: Vec<ProbeMemory>,
     /// Position at the beginning of the step and at its end without contact, m, and displacement
@@ -112,7 +167,10 @@ pub struct Probe {
 }
 
 impl Probe {
-    /// Makes a probe at `target` (m, world axes).
+    /// Largest number of corners.
+    pub const MAX_CORNERS: usize = 16;
+
+    /// Makes a ball at `target` (m, world axes).
     ///
     /// # Errors
     /// Returns [`StepError::Input`] for a number that is not finite or out of range.
@@ -123,9 +181,18 @@ impl Probe {
         Ok(Self {
             config,
             obstacles: Vec::new(),
+            seeds: vec![Vector3::zeros()],
+            corners: 1,
+            lever: 0.0,
             target,
             last_target: None,
             position: target,
+            turned: UnitQuaternion::identity(),
+            last_turned: UnitQuaternion::identity(),
+            start_rotation: UnitQuaternion::identity(),
+            free_rotation: UnitQuaternion::identity(),
+            rotation: UnitQuaternion::identity(),
+            torque: Vector3::zeros(),
             contacts: Vec::with_capacity(8),
             memory: Vec::with_capacity(8),
             start: target,
@@ -150,6 +217,60 @@ impl Probe {
         Ok(())
     }
 
+    /// Makes the probe the convex hull of these points (m from the tool point, own axes), rounded
+    /// by the radius. One point at the origin, as at first, is a ball, and two points a capsule.
+    /// Another shape begins its contacts anew.
+    ///
+    /// # Errors
+    /// Returns [`StepError::Input`] for a number that is not finite, for no points and for more than
+    /// [`Probe::MAX_CORNERS`]. The old shape then stays.
+    pub fn set_corners(&mut self, corners: &[[f64; 3]]) -> Result<(), StepError> {
+        corners.iter().try_for_each(|corner| finite("corner of a probe", corner))?;
+        let count = corners.len();
+        let some = (1..=Self::MAX_CORNERS).contains(&count);
+        StepError::check("number of corners of a probe", "1 to 16", some, count as f64)?;
+        let corners: Vec<_> = corners.iter().map(|corner| Vector3::from(*corner)).collect();
+        if self.corners() == corners {
+            return Ok(());
+        }
+        (self.seeds, self.corners) = (corners, count);
+        self.lever = self.seeds.iter().map(Vector3::norm).fold(0.0, f64::max);
+        let pairs = count * (count - 1) / 2;
+        let most = if pairs == 0 { 0 } else { ((MAX_SEEDS - count) / pairs).clamp(1, MAX_BETWEEN) };
+        for a in 0..count {
+            for b in a + 1..count {
+                let (from, way) = (self.seeds[a], self.seeds[b] - self.seeds[a]);
+                let between = (way.norm() / (2.0 * self.config.radius)).ceil().max(1.0) as usize;
+                let parts = between.min(most) + 1;
+                for k in 1..parts {
+                    let seed = from + way * (k as f64 / parts as f64);
+                    let near = |other: &Vector3<f64>| (other - seed).norm() < SAME * self.config.radius;
+                    // The middles of the diagonals of a box are one.
+                    if self.seeds.len() < MAX_SEEDS && !self.seeds.iter().any(near) {
+                        self.seeds.push(seed);
+                    }
+                }
+            }
+        }
+        self.forget();
+        Ok(())
+    }
+
+    /// The corners, m from the tool point, own axes.
+    pub(crate) fn corners(&self) -> &[Vector3<f64>] {
+        &self.seeds[..self.corners]
+    }
+
+    /// The places that stay: the corners, and then those between them.
+    pub(crate) fn spots(&self) -> impl Iterator<Item = Spot> + '_ {
+        self.seeds.iter().enumerate().map(|(number, at)| Spot { at: *at, fixed: Some(number) })
+    }
+
+    /// Whether a place that stays lies between corners.
+    pub(crate) fn is_between(&self, spot: &Spot) -> bool {
+        spot.fixed.is_some_and(|number| number >= self.corners)
+    }
+
     /// Moves the target of the spring (m, world axes). A target faster than 100 m/s is a teleport:
     /// the ball is then at the target, and its contacts begin anew.
     ///
@@ -158,6 +279,22 @@ impl Probe {
     pub fn set_target(&mut self, target: [f64; 3]) -> Result<(), StepError> {
         finite("target of a probe", &target)?;
         self.target = target.into();
+        Ok(())
+    }
+
+    /// Turns the target (unit quaternion x, y, z, w from own to world axes). A target that turns
+    /// faster than 100 rad/s is a teleport.
+    ///
+    /// # Errors
+    /// Returns [`StepError::Input`] for numbers that are not finite or of no length. The old
+    /// rotation then stays.
+    pub fn set_rotation(&mut self, rotation: [f64; 4]) -> Result<(), StepError> {
+        finite("rotation of a probe", &rotation)?;
+        let [x, y, z, w] = rotation;
+        let length = Vector3::new(x, y, z).norm().hypot(w);
+        let turned = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9);
+        StepError::check("rotation of a probe", "of length 1", turned.is_some(), length)?;
+        self.turned = turned.unwrap_or(self.turned);
         Ok(())
     }
 
@@ -181,9 +318,20 @@ impl Probe {
         &self.obstacles
     }
 
-    /// Center of the ball, m, world axes.
+    /// Position of the tool point, the center of a ball, m, world axes.
     pub fn position(&self) -> [f64; 3] {
         self.position.into()
+    }
+
+    /// Rotation from own to world axes, unit quaternion x, y, z, w.
+    pub fn rotation(&self) -> [f64; 4] {
+        let q = self.rotation.quaternion();
+        [q.i, q.j, q.k, q.w]
+    }
+
+    /// Distance of the farthest point of the shape from the tool point, m.
+    pub fn extent(&self) -> f64 {
+        self.lever + self.config.radius
     }
 
     /// What the ball touches and what is near it, after a step.
@@ -191,39 +339,159 @@ impl Probe {
         &self.contacts
     }
 
-    /// Sum of the forces on the ball over the last step, N, world axes. It is the force of the
+    /// Sum of the forces on the probe over the last step, N, world axes. It is the force of the
     /// spring and its damper on the hand.
     pub fn force(&self) -> [f64; 3] {
         let sum = self.contacts.iter().fold(Vector3::zeros(), |sum, c| sum + Vector3::from(c.force));
         sum.into()
     }
 
-    /// Places the ball at its target and forgets its contacts.
+    /// Torque of these forces about the tool point, N m, world axes: that of the spring against
+    /// turning on the hand. Zero of a ball, which no force turns.
+    pub fn torque(&self) -> [f64; 3] {
+        self.torque.into()
+    }
+
+    /// Places the probe at its target and forgets its contacts.
     pub fn forget(&mut self) {
         self.last_target = None;
         (self.position, self.start, self.free) = (self.target, self.target, self.target);
+        self.last_turned = self.turned;
+        (self.rotation, self.start_rotation, self.free_rotation) = (self.turned, self.turned, self.turned);
+        self.torque = Vector3::zeros();
         self.memory.clear();
         self.contacts.clear();
     }
 
-    /// Begins a step of `h` seconds. Returns how far the ball may go in it, m.
+    /// Begins a step of `h` seconds. Returns how far a point of the probe may go in it, m.
     pub(crate) fn begin_step(&mut self, h: f64) -> f64 {
         let last = self.last_target.unwrap_or(self.target);
-        if self.last_target.is_none() || (self.target - last).norm() > TELEPORT * h {
+        let turned = self.turned.angle_to(&self.last_turned);
+        if self.last_target.is_none() || (self.target - last).norm().max(turned) > TELEPORT * h {
             self.forget();
         }
         let stretch = self.position - self.last_target.unwrap_or(self.target);
         let ProbeConfig { stiffness, relaxation, .. } = self.config;
+        let left = relaxation / (relaxation + h);
         self.start = self.position;
-        self.free = self.target + stretch * (relaxation / (relaxation + h));
+        self.free = self.target + stretch * left;
         self.compliance = h / (stiffness * (h + relaxation));
         self.last_target = Some(self.target);
-        (self.free - self.start).norm()
+        let way = (self.free - self.start).norm();
+        self.start_rotation = self.rotation;
+        if self.lever > 0.0 {
+            let stretch = (self.rotation * self.last_turned.inverse()).scaled_axis();
+            self.free_rotation = UnitQuaternion::from_scaled_axis(stretch * left) * self.turned;
+        } else {
+            self.free_rotation = self.turned;
+        }
+        self.last_turned = self.turned;
+        way + self.lever * self.free_rotation.angle_to(&self.start_rotation)
     }
 
-    /// Moves the ball to where a force on it (N, world axes) lets it be at the end of the step.
-    pub(crate) fn respond(&mut self, force: &Vector3<f64>) {
+    /// Moves the probe to where a force on it (N, world axes) and its torque about the tool point
+    /// (N m) let it be at the end of the step.
+    pub(crate) fn respond(&mut self, force: &Vector3<f64>, torque: &Vector3<f64>) {
         self.position = self.free + self.compliance * force;
+        let turn = self.turning() * torque;
+        self.rotation = UnitQuaternion::from_scaled_axis(turn) * self.free_rotation;
+    }
+
+    /// Sets the torque of the step. A ball has none.
+    pub(crate) fn set_torque(&mut self, torque: Vector3<f64>) {
+        self.torque = if self.lever > 0.0 { torque } else { Vector3::zeros() };
+    }
+
+    /// Number of the coordinates of the spring in a solve.
+    pub(crate) fn width(&self) -> usize {
+        if self.lever > 0.0 { 6 } else { 3 }
+    }
+
+    /// Turn for a torque, rad/(N m).
+    pub(crate) fn turning(&self) -> f64 {
+        if self.lever > 0.0 { self.compliance / (self.lever * self.lever) } else { 0.0 }
+    }
+
+    /// Whether all numbers are finite.
+    pub(crate) fn is_finite(&self) -> bool {
+        self.position.iter().chain(self.rotation.coords.iter()).all(|x| x.is_finite())
+    }
+
+    /// Center of the sphere at a place, m, world axes, at the beginning of the step.
+    pub(crate) fn begun(&self, spot: &Vector3<f64>) -> Vector3<f64> {
+        if self.lever > 0.0 { self.start + self.start_rotation * spot } else { self.start }
+    }
+
+    /// Center of the sphere at a place, m, world axes, at the end of the computed step.
+    pub(crate) fn ended(&self, spot: &Vector3<f64>) -> Vector3<f64> {
+        if self.lever > 0.0 { self.position + self.rotation * spot } else { self.position }
+    }
+
+    /// From the tool point to where a surface with this outward normal touches the sphere at a
+    /// place, m, world axes, at the beginning and at the end of the computed step.
+    pub(crate) fn arms(&self, spot: &Vector3<f64>, normal: &Vector3<f64>) -> [Vector3<f64>; 2] {
+        let below = self.config.radius * normal;
+        [self.start_rotation * spot - below, self.rotation * spot - below]
+    }
+
+    /// Where the sphere's center would be at the end of the step if it had gone as the material of
+    /// the probe that touches, m, world axes.
+    pub(crate) fn carried(&self, spot: &Vector3<f64>, normal: &Vector3<f64>) -> Vector3<f64> {
+        if self.lever <= 0.0 {
+            return self.position;
+        }
+        let [arm, _] = self.arms(spot, normal);
+        let turn = self.rotation * self.start_rotation.inverse();
+        self.begun(spot) + (self.position - self.start) + (turn * arm - arm)
+    }
+
+    /// The place of the probe that is nearest to a surface, from `spot` on and no farther than
+    /// `most` (m), with the probe as it is at the beginning of the step or at its end. `look` returns the outward normal of the
+    /// surface that is nearest to a point (m, world axes), if any is near.
+    ///
+    /// A step leads towards the corner that lies lowest along the normal, to where the distance
+    /// grows again.
+    pub(crate) fn slide(
+        &self,
+        spot: &Vector3<f64>,
+        most: f64,
+        is_ended: bool,
+        mut look: impl FnMut(&Vector3<f64>) -> Result<Option<Vector3<f64>>, StepError>,
+    ) -> Result<Vector3<f64>, StepError> {
+        let turn = if is_ended { self.rotation } else { self.start_rotation };
+        let mut look = |spot: &Vector3<f64>| {
+            let point = if is_ended { self.ended(spot) } else { self.begun(spot) };
+            Ok::<_, StepError>(look(&point)?.map(|normal| turn.inverse() * normal))
+        };
+        let (mut at, mut left) = (*spot, most);
+        let Some(mut normal) = look(&at)? else { return Ok(at) };
+        for _ in 0..SLIDES {
+            let lowest = self.corners().iter().min_by(|a, b| normal.dot(a).total_cmp(&normal.dot(b)));
+            let Some(mut way) = lowest.map(|lowest| lowest - at) else { break };
+            let slope = normal.dot(&way);
+            // Comparisons with no number are false.
+            let falls = slope < -1e-4 * self.config.radius;
+            if !falls || left <= 0.0 {
+                break;
+            }
+            way *= (left / way.norm()).min(1.0);
+            let mut there = look(&(at + way))?;
+            while there.is_none() && way.norm() > SAME * self.config.radius {
+                way *= 0.5;
+                there = look(&(at + way))?;
+            }
+            let Some(mut next) = there else { break };
+            let (slope, rises) = (normal.dot(&way), next.dot(&way));
+            if rises > 0.0 {
+                way *= slope / (slope - rises);
+                let Some(found) = look(&(at + way))? else { break };
+                next = found;
+            }
+            at += way;
+            left -= way.norm();
+            normal = next;
+        }
+        Ok(at)
     }
 
     /// The compliance of what is rigid: a small share of the spring's, so that no law is singular.

@@ -1,8 +1,10 @@
 //! The solver: the laws of all contacts of a group of bodies together.
 
+use std::ops::Range;
+
 use nalgebra::{Matrix3, Vector3};
 
-use super::point::ContactPoint;
+use super::{Near, Spot, point::ContactPoint};
 use crate::{simd::dot, step::Frame};
 
 mod direct;
@@ -47,8 +49,9 @@ pub(crate) struct Look {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Touching {
     pub(crate) points: Vec<ContactPoint>,
-    /// One span per body.
+    /// One span per body, probe and rigid body, and which of them belong to probes.
     pub(crate) spans: Vec<Span>,
+    probes: Range<usize>,
     /// The sides of each point. Each has three rows of one entry per coordinate of its body, such
     /// that the response of point `i` to forces at point `j` is the sum of `rows_i rows_j^T` over
     /// the bodies of both.
@@ -81,6 +84,9 @@ pub(crate) struct Touching {
     /// The points whose sites belong to the other body of the current look, with force: where they
     /// touch, m.
     pub(crate) covered: Vec<Vector3<f64>>,
+    /// Places between the corners of a probe that penetrate the present body, and whether they have
+    /// passed through its surface.
+    pub(crate) between: Vec<(Near, bool, Spot)>,
     /// Site and bodies of each point, the second [`usize::MAX`] at an obstacle.
     pub(crate) heads: Vec<[usize; 3]>,
 }
@@ -155,9 +161,11 @@ impl Touching {
         index
     }
 
-    /// Lays out the coordinates of all bodies. `widths` has the number of each.
-    pub(crate) fn lay_out(&mut self, widths: impl Iterator<Item = usize>) {
+    /// Lays out the coordinates of all bodies. `widths` has the number of each, and `probes` are
+    /// those of them that are springs of probes.
+    pub(crate) fn lay_out(&mut self, widths: impl Iterator<Item = usize>, probes: Range<usize>) {
         self.spans.clear();
+        self.probes = probes;
         let mut start = 0;
         for width in widths {
             self.spans.push(Span { start, width, reach: 0 });
@@ -209,10 +217,11 @@ impl Touching {
             }
         }
         let (mut rigid, mut modal) = (0.0, 0.0);
-        for span in &self.spans {
+        for (member, span) in self.spans.iter().enumerate() {
             for (k, x) in self.sum[span.start..][..span.width].iter().enumerate() {
                 // The spring of a probe is no rigid body.
-                let part = if k + 6 < span.width || span.width < 6 { &mut modal } else { &mut rigid };
+                let is_modal = k + 6 < span.width || self.probes.contains(&member);
+                let part = if is_modal { &mut modal } else { &mut rigid };
                 *part += x * x;
             }
         }

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::warp::coefficients;
+use crate::warp::coefficients_of;
 use crate::{
     ModalModel, StepError,
     error::finite,
@@ -164,28 +164,60 @@ impl MassSites {
 
     /// Returns the work for the six numbers of each part and replaces these numbers by the
     /// derivatives of the work.
-    ///
-    /// The nonlinear part of a part's displacement is `A w x u + B w x (w x u)` (Choi and Ko 2005),
-    /// so the work is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
     fn work_and_forces(&self, force: &MassForce, six: &mut [Each; 6]) -> f64 {
-        let mut work = 0.0;
-        for (i, mass) in self.mass.iter().enumerate() {
-            let [x, y, z, wx, wy, wz] = six.each_ref().map(|row| row[i]);
-            let place = Vector3::from(self.places.each_ref().map(|row| row[i]));
-            let (u, w) = (Vector3::new(x, y, z), Vector3::new(wx, wy, wz));
-            let g = *mass * (force.uniform + force.gradient * place);
-            let s = w.norm_squared();
-            let [a, b, da, db] = coefficients(s);
-            let (across, gw, wu, gu) = (u.cross(&g), g.dot(&w), w.dot(&u), g.dot(&u));
-            let (once, twice) = (w.dot(&across), gw * wu - s * gu);
-            work += a * once + b * twice;
-            let by_u = a * g.cross(&w) + b * (gw * w - s * g);
-            let by_w = a * across + b * (wu * g + gw * u - 2.0 * gu * w) + 2.0 * (da * once + db * twice) * w;
-            for (row, value) in six.iter_mut().zip(by_u.iter().chain(&by_w)) {
-                row[i] = *value;
+        widest(Bend { sites: self, force, six })
+    }
+}
+
+/// The work on all parts, side by side.
+///
+/// The nonlinear part of a part's displacement is `A w x u + B w x (w x u)` (Choi and Ko 2005), so
+/// the work is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
+struct Bend<'a> {
+    sites: &'a MassSites,
+    force: &'a MassForce,
+    six: &'a mut [Each; 6],
+}
+
+impl Work for Bend<'_> {
+    type Out = f64;
+    #[inline(always)]
+    fn run(self) -> f64 {
+        let Self { sites: MassSites { mass, places, .. }, force, six } = self;
+        let mut weights = [[0.0; SITES]; 3];
+        for (axis, weights) in weights.iter_mut().enumerate() {
+            let [x, y, z] = [0, 1, 2].map(|of| force.gradient[(axis, of)]);
+            for i in 0..SITES {
+                let change = x * places[0][i] + y * places[1][i] + z * places[2][i];
+                weights[i] = mass[i] * (force.uniform[axis] + change);
             }
         }
-        work
+        let mut s = [0.0; SITES];
+        for i in 0..SITES {
+            s[i] = six[3][i] * six[3][i] + six[4][i] * six[4][i] + six[5][i] * six[5][i];
+        }
+        let [a, b, da, db] = coefficients_of(&s);
+        let mut work = [0.0; SITES];
+        for i in 0..SITES {
+            let [u, w] = [0, 3].map(|at| [six[at][i], six[at + 1][i], six[at + 2][i]]);
+            let g = [weights[0][i], weights[1][i], weights[2][i]];
+            let dot = |x: &[f64; 3], y: &[f64; 3]| x[0] * y[0] + x[1] * y[1] + x[2] * y[2];
+            let cross = |x: &[f64; 3], y: &[f64; 3]| {
+                [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+            };
+            let (across, turned) = (cross(&u, &g), cross(&g, &w));
+            let (gw, wu, gu) = (dot(&g, &w), dot(&w, &u), dot(&g, &u));
+            let (once, twice) = (dot(&w, &across), gw * wu - s[i] * gu);
+            work[i] = a[i] * once + b[i] * twice;
+            let both = 2.0 * (da[i] * once + db[i] * twice);
+            for axis in 0..3 {
+                six[axis][i] = a[i] * turned[axis] + b[i] * (gw * w[axis] - s[i] * g[axis]);
+                six[3 + axis][i] = a[i] * across[axis]
+                    + b[i] * (wu * g[axis] + gw * u[axis] - 2.0 * gu * w[axis])
+                    + both * w[axis];
+            }
+        }
+        work.iter().sum()
     }
 }
 

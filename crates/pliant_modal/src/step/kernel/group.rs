@@ -236,7 +236,8 @@ impl<P: Member> Group<'_, P> {
                 return Err(StepError::Diverged { what });
             }
         }
-        Ok(())
+        let sound = self.held.iter().all(|&index| self.probes[index].is_finite());
+        if sound { Ok(()) } else { Err(StepError::Diverged { what: "a probe" }) }
     }
 
     fn step(&mut self, work: &mut Touching) -> Result<(), StepError> {
@@ -364,14 +365,8 @@ impl<P: Member> Group<'_, P> {
             kernel.push.is_on = false;
         }
         for &index in self.held {
-            let mut sum = Vector3::zeros();
-            for point in &work.points {
-                if let Some(at) = point.probe.as_ref().filter(|at| at.probe == index) {
-                    let force = point.world_force();
-                    sum += if at.first.is_some() { -force } else { force };
-                }
-            }
-            self.probes[index].respond(&sum);
+            let [force, torque] = points::pull_on_probe(&work.points, index);
+            self.probes[index].respond(&force, &torque);
         }
         points::respond(self, work, theta);
     }
@@ -461,8 +456,9 @@ impl<P: Member> Group<'_, P> {
     /// Writes the rows of all points.
     fn fill_rows(&self, work: &mut Touching) {
         let bodies = (0..self.len()).map(|member| self.view(member).kernel.modes() + 6);
-        let others = self.held.iter().map(|_| 3).chain(self.pushed.iter().map(|_| 6));
-        work.lay_out(bodies.chain(others));
+        let probes = self.held.iter().map(|&index| self.probes[index].width());
+        let others = probes.chain(self.pushed.iter().map(|_| 6));
+        work.lay_out(bodies.chain(others), self.len()..self.len() + self.held.len());
         work.lay_out_rows();
         for member in 0..self.len() {
             let view = self.view(member);
@@ -498,18 +494,7 @@ impl<P: Member> Group<'_, P> {
                 }
             }
         }
-        for (point, sides) in work.points.iter().zip(&work.sides) {
-            let Some(at) = &point.probe else { continue };
-            // The force is on the probe at an obstacle, and against it at a body. Squares of the
-            // rows are the compliance of its spring.
-            let (side, sign) = if at.first.is_some() { (sides[1], -1.0) } else { (sides[0], 1.0) };
-            let Some(side) = side else { continue };
-            let root = sign * self.probes[at.probe].compliance.sqrt();
-            for axis in 0..3 {
-                let row = &mut work.rows[side.rows + 3 * axis..][..3];
-                row.iter_mut().zip(&point.axes.row(axis)).for_each(|(x, axis)| *x = root * axis);
-            }
-        }
+        points::fill_probe_rows(self.probes, work);
         points::fill_rows(self.rigids, work, self.h);
     }
 

@@ -28,7 +28,7 @@ pub(super) use begin::begin;
 pub(super) use detect::detect;
 pub(super) use drill::drill;
 use pass::march;
-pub(super) use probes::{begin_probes, detect_probes, keep_at_probe};
+pub(super) use probes::{begin_probes, detect_probes, fill_probe_rows, keep_at_probe, pull_on_probe};
 pub(super) use rigid::{begin_supports, fill_rows, respond, set_arms, support, take_supports, write_forces};
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.

@@ -31,6 +31,8 @@ impl<P: Member> Group<'_, P> {
         });
         for &probe in self.held {
             self.probes[probe].memory.clear();
+            let [_, torque] = points::pull_on_probe(&work.points, probe);
+            self.probes[probe].set_torque(torque);
         }
         points::write_forces(self, work);
         for point in &work.points {

@@ -14,33 +14,49 @@ use super::{
     share,
 };
 use crate::{
-    ProbeContact, StepError,
-    contact::{AtProbe, Carriers, ContactPoint, Grown, Near, Place, ProbeMemory, Shape, Touched, Touching},
+    ObstacleShape, Probe, ProbeContact, StepError,
+    contact::{
+        AtProbe, Carriers, ContactPoint, Grown, Near, Place, ProbeMemory, Shape, Spot, SurfacePoint, Touched,
+        Touching,
+    },
     step::Tangent,
 };
 
-/// Way in a step, as a share of the ball's radius, beyond which the ball meets the plane of the
+/// Way in a step, as a share of the radius, beyond which a place of a probe meets the plane of the
 /// place that it had, and not the place that is nearest after the way.
 const FAR: f64 = 0.5;
 
-/// Depth of a ball's center inside a body down to which it is pushed out, as a share of the body's
-/// size.
+/// Depth of a sphere's center inside a body down to which it is pushed out, as a share of the
+/// body's size.
 const DEEP: f64 = 0.1;
 
-/// How far from a ball's center the nearest place of a body is searched, m.
+/// How far from a sphere's center the nearest place of a body is searched, m.
 fn reach(radius: f64, size: f64) -> f64 {
     (2.0 * radius).max(DEEP * size)
 }
 
-/// Whether the ball has gone far in this step.
-fn is_far(probe: &crate::Probe) -> bool {
+/// Whether a place of a probe has gone far in this step.
+fn is_far(probe: &Probe, spot: &Spot) -> bool {
     // Comparisons with no number are false.
-    (probe.position - probe.start).norm() > FAR * probe.config().radius
+    (probe.ended(&spot.at) - probe.begun(&spot.at)).norm() > FAR * probe.config().radius
 }
 
 /// The plane of a surface to which the nearest place of a body belongs.
 fn plane_of(near: &Near, center: &Vector3<f64>) -> [Vector3<f64>; 2] {
     [center - near.distance * near.normal, near.normal]
+}
+
+/// Whether a place of a probe that is near an existing contact with the same thing is no other.
+fn is_taken(work: &Touching, of: impl Fn(&ContactPoint, &AtProbe) -> bool, spot: &Spot, radius: f64) -> bool {
+    let same = |at: &AtProbe| at.nearest.is_same(spot, radius) || at.spot.is_same(spot, radius);
+    work.points.iter().any(|point| point.probe.is_some_and(|at| same(&at) && of(point, &at)))
+}
+
+/// The side of a new contact at a probe, with the plane of the surface.
+fn at_probe((index, span): (usize, usize), probe: &Probe, spot: Spot, plane: [Vector3<f64>; 2]) -> AtProbe {
+    let [arm, _] = probe.arms(&spot.at, &plane[1]);
+    let carried = probe.begun(&spot.at);
+    AtProbe { probe: index, span, first: None, last: None, spot, nearest: spot, arm, carried, plane }
 }
 
 /// Sets up the contacts of probes that the step before left.
@@ -50,25 +66,27 @@ pub(in super::super) fn begin_probes<P: Member>(
 ) -> Result<(), StepError> {
     for (number, &index) in group.held.iter().enumerate() {
         let (probe, span) = (&group.probes[index], group.len() + number);
-        let friction = probe.config().friction;
-        for memory in &probe.memory {
-            let point = match memory.other {
+        let (radius, own) = (probe.config().radius, (index, span));
+        let of = |between: bool| {
+            probe.memory.iter().filter(move |memory| probe.is_between(&memory.spot) == between)
+        };
+        for memory in of(false).chain(of(true)) {
+            match memory.other {
                 Touched::Obstacle(at) => {
                     let Some(obstacle) = probe.obstacles().get(at) else { continue };
-                    let found = look(&**obstacle, &probe.start)?;
-                    let friction = friction_at(friction, &**obstacle);
-                    let mut point = ContactPoint::new(span, at, memory.other, friction);
-                    point.carried = carried(&**obstacle, &probe.start, group.h)?;
-                    point.start = probe.start;
-                    point.compliance = probe.rigid();
-                    let plane = [probe.start - found.distance * found.normal, found.normal];
-                    point.probe = Some(AtProbe { probe: index, span, first: None, last: None, plane });
-                    point.gap = look(&**obstacle, &(probe.start + point.carried))?.distance;
-                    point.gap -= probe.config().radius;
+                    let spot = slide(probe, &memory.spot, false, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
+                    if is_taken(work, |point, _| is_at_obstacle(point, span, at), &spot, radius) {
+                        continue;
+                    }
+                    let center = probe.begun(&spot.at);
+                    let found = look(&**obstacle, &center)?;
+                    let mut point = at_obstacle(probe, own, at, &**obstacle, spot, &found);
+                    point.carried = carried(&**obstacle, &center, group.h)?;
+                    point.gap = look(&**obstacle, &(center + point.carried))?.distance - radius;
                     let carried = point.carried;
-                    let anchor = memory.anchor + carried;
+                    let anchor = memory.anchor + (center - probe.begun(&memory.spot.at)) + carried;
                     resume(&mut point, memory.force, &found.normal, anchor, carried, f64::INFINITY);
-                    point
+                    work.points.push(point);
                 }
                 Touched::Body(key) => {
                     let Some(member) = find(group, key) else { continue };
@@ -76,39 +94,114 @@ pub(in super::super) fn begin_probes<P: Member>(
                     let (Some([shape, _]), Some(place)) = (group.shapes(member), memory.place) else {
                         continue;
                     };
-                    let within = reach(probe.config().radius, shape.size);
-                    let near = shape.nearest(&probe.start, within, Some(&place));
-                    let near = near.unwrap_or_else(|| shape.at(&place, &probe.start));
-                    let mut point = at_body(&view, &shape, (member, span, index), &place, probe, &near);
-                    point.gap = near.distance - probe.config().radius;
+                    let within = reach(radius, shape.size);
+                    let mut hint = place;
+                    let spot = slide(probe, &memory.spot, false, |x| {
+                        Ok(normal_of(shape.nearest(x, within, Some(&hint)), &mut hint))
+                    })?;
+                    if is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
+                        continue;
+                    }
+                    let center = probe.begun(&spot.at);
+                    let near = shape.nearest(&center, within, Some(&place));
+                    let near = near.unwrap_or_else(|| shape.at(&place, &center));
+                    let mut point = at_body(&view, &shape, member, &place, (probe, own, spot), &near);
+                    point.gap = near.distance - radius;
                     let (normal, farthest) = (-near.normal, SNAPPED * shape.size);
-                    resume(&mut point, memory.force, &normal, memory.anchor, -probe.start, farthest);
-                    point
+                    let anchor = memory.anchor - (center - probe.begun(&memory.spot.at));
+                    resume(&mut point, memory.force, &normal, anchor, -center, farthest);
+                    if !(probe.is_between(&spot) && shares_site(work, &point)) {
+                        work.points.push(point);
+                    }
                 }
-                Touched::Probe(_) | Touched::Attachment(_) => continue,
-            };
-            work.points.push(point);
+                Touched::Probe(_) | Touched::Attachment(_) => {}
+            }
         }
     }
     Ok(())
+}
+
+/// The normal of what was found, whose place the next search begins with.
+fn normal_of(near: Option<Near>, hint: &mut Place) -> Option<Vector3<f64>> {
+    near.map(|near| {
+        *hint = near.place;
+        near.normal
+    })
+}
+
+fn is_at_obstacle(point: &ContactPoint, span: usize, obstacle: usize) -> bool {
+    point.member == span && point.other == Touched::Obstacle(obstacle)
+}
+
+fn is_at_body(point: &ContactPoint, at: &AtProbe, member: usize, probe: usize) -> bool {
+    point.member == member && at.first.is_some() && at.probe == probe
+}
+
+/// The place of a probe that is nearest to a surface, no farther from `spot` than a radius: what is
+/// nearer farther away is another contact. Some places stay.
+fn slide(
+    probe: &Probe,
+    spot: &Spot,
+    is_ended: bool,
+    look: impl FnMut(&Vector3<f64>) -> Result<Option<Vector3<f64>>, StepError>,
+) -> Result<Spot, StepError> {
+    match spot.fixed {
+        Some(_) => Ok(*spot),
+        None => Ok(Spot { at: probe.slide(&spot.at, probe.config().radius, is_ended, look)?, fixed: None }),
+    }
+}
+
+/// The site that carries most of a point at a body.
+fn site_of(point: &ContactPoint) -> Option<usize> {
+    point.probe.and_then(|at| at.first)?.1.largest()
+}
+
+/// Whether a place between corners would share its site with another place of the probe, whose
+/// dent it then has already.
+fn shares_site(work: &Touching, new: &ContactPoint) -> bool {
+    let (Some(at), Some(site)) = (new.probe, site_of(new)) else { return false };
+    let same = |point: &ContactPoint| {
+        point.member == new.member
+            && point.probe.is_some_and(|other| other.probe == at.probe)
+            && site_of(point) == Some(site)
+    };
+    work.points.iter().any(same)
+}
+
+/// A contact of a probe with an obstacle, before its first look at the end of the step.
+fn at_obstacle(
+    probe: &Probe,
+    (index, span): (usize, usize),
+    at: usize,
+    obstacle: &dyn ObstacleShape,
+    spot: Spot,
+    found: &SurfacePoint,
+) -> ContactPoint {
+    let friction = friction_at(probe.config().friction, obstacle);
+    let mut point = ContactPoint::new(span, at, Touched::Obstacle(at), friction);
+    point.start = probe.begun(&spot.at);
+    point.compliance = probe.rigid();
+    let plane = [point.start - found.distance * found.normal, found.normal];
+    point.probe = Some(at_probe((index, span), probe, spot, plane));
+    point
 }
 
 /// A contact of a probe with a body, before its first look at the end of the step.
 fn at_body(
     view: &View<'_>,
     shape: &Shape<'_>,
-    (member, span, index): (usize, usize, usize),
+    member: usize,
     place: &Place,
-    probe: &crate::Probe,
+    (probe, of, spot): (&Probe, (usize, usize), Spot),
     near: &Near,
 ) -> ContactPoint {
     let friction = (view.contacts.friction() * probe.config().friction).sqrt();
-    let mut point = ContactPoint::new(member, 0, Touched::Probe(index), friction);
+    let mut point = ContactPoint::new(member, 0, Touched::Probe(of.0), friction);
     let carriers = shape.field.carriers(place);
     (point.start, point.tangent) = shape.material(place, &carriers);
     let first = Some((*place, carriers));
-    let plane = plane_of(near, &probe.start);
-    point.probe = Some(AtProbe { probe: index, span, first, last: Some(near.place), plane });
+    let side = at_probe(of, probe, spot, plane_of(near, &probe.begun(&spot.at)));
+    point.probe = Some(AtProbe { first, last: Some(near.place), ..side });
     point.arm = point.start - Vector3::from(shape.frame.center());
     point.compliance = compliance(view, shape, &carriers);
     point
@@ -124,66 +217,234 @@ pub(in super::super) fn detect_probes<P: Member>(
     work: &mut Touching,
 ) -> Result<bool, StepError> {
     let mut penetrates = false;
+    unite(group, work);
     for (number, &index) in group.held.iter().enumerate() {
         let (probe, span) = (&group.probes[index], group.len() + number);
-        let radius = probe.config().radius;
-        let (from, to) = (probe.start, probe.position);
-        let way = to - from;
-        for (at, obstacle) in probe.obstacles().iter().enumerate() {
-            let same = |point: &ContactPoint| point.member == span && point.other == Touched::Obstacle(at);
-            if work.points.iter().any(same) {
-                continue;
-            }
-            let grown = Grown { shape: &**obstacle, by: radius };
-            let (begin, mut found) = (look(&grown, &from)?, look(&grown, &to)?);
-            let passed = if is_far(probe) { march(&grown, &from, &way, begin)? } else { None };
-            found = passed.unwrap_or(found);
-            if found.distance >= radius {
-                continue;
-            }
-            let friction = friction_at(probe.config().friction, &**obstacle);
-            let mut point = ContactPoint::new(span, at, Touched::Obstacle(at), friction);
-            point.start = from;
-            point.carried = carried(&**obstacle, &to, group.h)?;
-            point.gap = look(&grown, &(from + point.carried))?.distance;
-            let slid = way - point.carried;
-            point.anchor = from + point.carried + share(point.gap, found.distance) * slid;
-            point.passed = passed.is_some();
-            let plane = [to - (found.distance + radius) * found.normal, found.normal];
-            point.probe = Some(AtProbe { probe: index, span, first: None, last: None, plane });
-            point.turn(&found.normal);
-            penetrates |= found.distance < 0.0;
-            work.points.push(point);
+        for at in 0..probe.obstacles().len() {
+            penetrates |= detect_at_obstacle(group, work, (index, span), at)?;
         }
         for member in 0..group.len() {
-            let same = |point: &ContactPoint| {
-                point.member == member && point.probe.is_some_and(|probe| probe.probe == index)
-            };
-            if !probe.near.contains(&group.who[member]) || work.points.iter().any(same) {
-                continue;
+            if probe.near.contains(&group.who[member]) {
+                penetrates |= detect_at_body(group, work, (index, span), member)?;
             }
-            let view = group.view(member);
-            let Some([start, end]) = group.shapes(member) else { continue };
-            let swept = is_far(probe)
-                .then(|| end.sweep(&start.pull_back(&from), &end.pull_back(&to), radius))
-                .flatten();
-            let near = match &swept {
-                Some(place) => Some(end.at(place, &to)),
-                None => end.nearest(&to, reach(radius, end.size), None),
-            };
-            let Some(near) = near.filter(|near| near.distance < 2.0 * radius) else { continue };
-            let begun = start.at(&near.place, &from);
-            let mut point = at_body(&view, &start, (member, span, index), &near.place, probe, &begun);
-            point.gap = begun.distance - radius;
-            point.passed = swept.is_some();
-            let ended = end.material(&near.place, &end.field.carriers(&near.place)).0;
-            let slid = (ended - point.start) - way;
-            point.anchor = point.start - from + share(point.gap, near.distance - radius) * slid;
-            point.turn(&-near.normal);
-            penetrates |= near.distance < radius;
-            work.points.push(point);
         }
     }
+    Ok(penetrates)
+}
+
+/// Makes one point of those whose places on a probe have slid together. It has the force of both.
+fn unite<P: Member>(group: &Group<'_, P>, work: &mut Touching) {
+    let mut number = 0;
+    while number < work.points.len() {
+        let point = work.points[number];
+        let other = point.probe.filter(|at| at.nearest.fixed.is_none()).and_then(|at| {
+            let radius = group.probes[at.probe].config().radius;
+            let same = |other: &ContactPoint| {
+                (other.member, other.other) == (point.member, point.other)
+                    && other
+                        .probe
+                        .is_some_and(|own| own.probe == at.probe && own.nearest.is_same(&at.nearest, radius))
+            };
+            (0..work.points.len()).find(|&other| other != number && same(&work.points[other]))
+        });
+        match other {
+            Some(other) => {
+                let force = point.world_force();
+                let kept = &mut work.points[other];
+                kept.pushed += kept.axes * force;
+                kept.force = kept.pushed;
+                work.points.remove(number);
+            }
+            None => number += 1,
+        }
+    }
+}
+
+/// Rise of a surface beside the place of a probe that is nearest to it, as a share of the radius,
+/// below which it is flat there: the corners are enough.
+const FLAT: f64 = 1e-3;
+
+/// Whether a surface falls away from a place between the corners of a probe towards all of them.
+/// `look` has the distance of a point (m, world axes), if it is near.
+fn is_summit(
+    probe: &Probe,
+    spot: &Spot,
+    distance: f64,
+    mut look: impl FnMut(&Vector3<f64>) -> Result<Option<f64>, StepError>,
+) -> Result<bool, StepError> {
+    let radius = probe.config().radius;
+    for corner in probe.corners() {
+        let way = corner - spot.at;
+        let length = way.norm();
+        if length <= 0.0 {
+            return Ok(false);
+        }
+        let beside = spot.at + way * (0.5 * length).min(2.0 * radius) / length;
+        if look(&probe.ended(&beside))?.is_some_and(|there| there < distance + FLAT * radius) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// Adds points for the places of a probe that touch an obstacle or are near it: all corners, and
+/// the place between them that is nearest. Returns whether any penetrates.
+fn detect_at_obstacle<P: Member>(
+    group: &Group<'_, P>,
+    work: &mut Touching,
+    (index, span): (usize, usize),
+    at: usize,
+) -> Result<bool, StepError> {
+    let probe = &group.probes[index];
+    let (obstacle, radius) = (&*probe.obstacles()[at], probe.config().radius);
+    let grown = Grown { shape: obstacle, by: radius };
+    // The surface where a place ends, and whether it has passed through.
+    let look_at = |spot: &Spot| {
+        let [from, to] = [probe.begun(&spot.at), probe.ended(&spot.at)];
+        let found = look(&grown, &to)?;
+        let passed = if is_far(probe, spot) {
+            march(&grown, &from, &(to - from), look(&grown, &from)?)?
+        } else {
+            None
+        };
+        Ok::<_, StepError>((passed.unwrap_or(found), passed.is_some()))
+    };
+    let mut penetrates = false;
+    let mut add = |work: &mut Touching, spot: Spot, found: SurfacePoint, passed: bool| {
+        let [from, to] = [probe.begun(&spot.at), probe.ended(&spot.at)];
+        let mut point = at_obstacle(probe, (index, span), at, obstacle, spot, &found);
+        point.carried = carried(obstacle, &to, group.h)?;
+        point.gap = look(&grown, &(from + point.carried))?.distance;
+        let slid = to - from - point.carried;
+        point.anchor = from + point.carried + share(point.gap, found.distance) * slid;
+        point.passed = passed;
+        if let Some(side) = &mut point.probe {
+            side.plane = [to - (found.distance + radius) * found.normal, found.normal];
+        }
+        point.turn(&found.normal);
+        penetrates |= found.distance < 0.0;
+        work.points.push(point);
+        Ok::<_, StepError>(())
+    };
+    let mut nearest: Option<(SurfacePoint, bool, Spot)> = None;
+    for spot in probe.spots() {
+        let is_corner = !probe.is_between(&spot);
+        if is_corner && is_taken(work, |point, _| is_at_obstacle(point, span, at), &spot, radius) {
+            continue;
+        }
+        let (found, passed) = look_at(&spot)?;
+        if is_corner && found.distance < radius {
+            add(work, spot, found, passed)?;
+        } else if !is_corner && nearest.is_none_or(|(other, ..)| found.distance < other.distance) {
+            nearest = Some((found, passed, spot));
+        }
+    }
+    // What is rigid needs no places between but the one that is nearest.
+    if let Some((mut found, passed, Spot { at: mut place, .. })) = nearest {
+        if !passed {
+            place = probe.slide(&place, f64::INFINITY, true, |x| Ok(Some(look(obstacle, x)?.normal)))?;
+            found = look(&grown, &probe.ended(&place))?;
+        }
+        let spot = Spot { at: place, fixed: None };
+        let taken = is_taken(work, |point, _| is_at_obstacle(point, span, at), &spot, radius);
+        let alone = !work.points.iter().any(|point| is_at_obstacle(point, span, at));
+        let distance = |x: &Vector3<f64>| Ok(Some(look(&grown, x)?.distance));
+        let near = found.distance < radius && !taken;
+        if near && (if passed { alone } else { is_summit(probe, &spot, found.distance, distance)? }) {
+            add(work, spot, found, passed)?;
+        }
+    }
+    Ok(penetrates)
+}
+
+/// As [`detect_at_obstacle`], at a body, with the places between corners that penetrate, one for
+/// each site.
+fn detect_at_body<P: Member>(
+    group: &Group<'_, P>,
+    work: &mut Touching,
+    (index, span): (usize, usize),
+    member: usize,
+) -> Result<bool, StepError> {
+    let (probe, view) = (&group.probes[index], group.view(member));
+    let radius = probe.config().radius;
+    let Some([start, end]) = group.shapes(member) else { return Ok(false) };
+    let within = reach(radius, end.size);
+    let look_at = |spot: &Spot| {
+        let [from, to] = [probe.begun(&spot.at), probe.ended(&spot.at)];
+        let swept = is_far(probe, spot)
+            .then(|| end.sweep(&start.pull_back(&from), &end.pull_back(&to), radius))
+            .flatten();
+        match &swept {
+            Some(place) => Some((end.at(place, &to), true)),
+            None => Some((end.nearest(&to, within, None)?, false)),
+        }
+    };
+    let mut penetrates = false;
+    let mut add = |work: &mut Touching, spot: Spot, near: &Near, passed: bool| {
+        let [from, to] = [probe.begun(&spot.at), probe.ended(&spot.at)];
+        let begun = start.at(&near.place, &from);
+        let mut point = at_body(&view, &start, member, &near.place, (probe, (index, span), spot), &begun);
+        point.gap = begun.distance - radius;
+        point.passed = passed;
+        let ended = end.material(&near.place, &end.field.carriers(&near.place)).0;
+        let slid = (ended - point.start) - (to - from);
+        point.anchor = point.start - from + share(point.gap, near.distance - radius) * slid;
+        point.turn(&-near.normal);
+        if probe.is_between(&spot) && shares_site(work, &point) {
+            return;
+        }
+        penetrates |= near.distance < radius;
+        work.points.push(point);
+    };
+    let mut nearest: Option<(Near, bool, Spot)> = None;
+    let mut between = std::mem::take(&mut work.between);
+    between.clear();
+    for spot in probe.spots() {
+        if is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
+            continue;
+        }
+        let Some((near, passed)) = look_at(&spot) else { continue };
+        if !probe.is_between(&spot) {
+            if near.distance < 2.0 * radius {
+                add(work, spot, &near, passed);
+            }
+            continue;
+        }
+        if near.distance < radius {
+            between.push((near, passed, spot));
+        }
+        if nearest.is_none_or(|(other, ..)| near.distance < other.distance) {
+            nearest = Some((near, passed, spot));
+        }
+    }
+    if let Some((mut near, passed, Spot { at: mut place, .. })) = nearest {
+        if !passed {
+            let mut hint = near.place;
+            place = probe.slide(&place, f64::INFINITY, true, |x| {
+                Ok(normal_of(end.nearest(x, within, Some(&hint)), &mut hint))
+            })?;
+            near = end.nearest(&probe.ended(&place), within, Some(&hint)).unwrap_or(near);
+        }
+        let spot = Spot { at: place, fixed: None };
+        let taken = is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius);
+        let distance =
+            |x: &Vector3<f64>| Ok(end.nearest(x, within, Some(&near.place)).map(|near| near.distance));
+        let touches = near.distance < 2.0 * radius && !taken;
+        let alone = |work: &Touching| {
+            let of_both = |at: AtProbe, point| is_at_body(point, &at, member, index);
+            !work.points.iter().any(|point| point.probe.is_some_and(|at| of_both(at, point)))
+        };
+        if touches && (if passed { alone(work) } else { is_summit(probe, &spot, near.distance, distance)? }) {
+            add(work, spot, &near, passed);
+        }
+    }
+    // A soft surface is pressed along the whole length between corners.
+    for (near, passed, spot) in between.drain(..) {
+        if !is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
+            add(work, spot, &near, passed);
+        }
+    }
+    work.between = between;
     Ok(penetrates)
 }
 
@@ -195,32 +456,45 @@ pub(super) fn linearize_at_probe<P: Member>(
 ) -> Result<(), StepError> {
     let Some(mut at) = point.probe else { return Ok(()) };
     let probe = &group.probes[at.probe];
-    let (radius, x) = (probe.config().radius, probe.position);
-    let far = is_far(probe) || point.passed;
+    let radius = probe.config().radius;
+    let far = is_far(probe, &at.spot) || point.passed;
     let distance = match &at.first {
         None => {
             let Touched::Obstacle(index) = point.other else { return Ok(()) };
             let Some(obstacle) = probe.obstacles().get(index) else { return Ok(()) };
+            if !far {
+                at.nearest = slide(probe, &at.nearest, true, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
+            }
+            let x = probe.ended(&at.nearest.at);
             if !far {
                 let found = look(&**obstacle, &x)?;
                 at.plane = [x - found.distance * found.normal, found.normal];
             }
             point.compliance = probe.rigid();
             point.turn(&at.plane[1]);
-            point.end = x;
+            at.carried = probe.carried(&at.spot.at, &at.plane[1]);
+            point.end = at.carried;
             point.floor = floor(point.gap, RECOVERY_SPEED * radius * group.h, recovers);
             at.plane[1].dot(&(x - at.plane[0])) - radius
         }
         Some((place, carriers)) => {
             let view = group.view(point.member);
             let Some([_, shape]) = group.shapes(point.member) else { return Ok(()) };
-            let last = at.last.unwrap_or(*place);
-            let near = if far { None } else { shape.nearest(&x, reach(radius, shape.size), Some(&last)) };
+            let mut last = at.last.unwrap_or(*place);
+            let within = reach(radius, shape.size);
+            if !far {
+                at.nearest = slide(probe, &at.nearest, true, |x| {
+                    Ok(normal_of(shape.nearest(x, within, Some(&last)), &mut last))
+                })?;
+            }
+            let x = probe.ended(&at.nearest.at);
+            let near = if far { None } else { shape.nearest(&x, within, Some(&last)) };
             let near = near.unwrap_or_else(|| shape.at(&last, &x));
             (at.last, at.plane) = (Some(near.place), plane_of(&near, &x));
             let (end, tangent): (_, Tangent) = shape.material(place, carriers);
             point.end = end;
-            point.carried = x - probe.start;
+            at.carried = probe.carried(&at.spot.at, &near.normal);
+            point.carried = at.carried - probe.begun(&at.spot.at);
             point.compliance = compliance(&view, &shape, carriers);
             point.turn(&-near.normal);
             if point.mean.is_none() {
@@ -232,12 +506,46 @@ pub(super) fn linearize_at_probe<P: Member>(
             near.distance - radius
         }
     };
+    [_, at.arm] = probe.arms(&at.nearest.at, &at.plane[1]);
     point.place = at.plane[0];
-    let from = if at.first.is_some() { x } else { Vector3::zeros() };
+    let from = if at.first.is_some() { at.carried } else { Vector3::zeros() };
     let offset = point.axes * (point.end - from - point.anchor);
     point.off = Vector3::new(distance - point.floor, offset[1], offset[2]);
     point.probe = Some(at);
     Ok(())
+}
+
+/// Sum of the forces of the points on a probe, N, and their torque about the tool point, N m.
+pub(in super::super) fn pull_on_probe(points: &[ContactPoint], index: usize) -> [Vector3<f64>; 2] {
+    let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
+    for point in points {
+        if let Some(at) = point.probe.as_ref().filter(|at| at.probe == index) {
+            let pull = if at.first.is_some() { -point.world_force() } else { point.world_force() };
+            force += pull;
+            torque += at.arm.cross(&pull);
+        }
+    }
+    [force, torque]
+}
+
+/// Writes the rows of the probes' springs. Their squares are the compliance.
+pub(in super::super) fn fill_probe_rows(probes: &[Probe], work: &mut Touching) {
+    for (point, sides) in work.points.iter().zip(&work.sides) {
+        let Some(at) = &point.probe else { continue };
+        // The force is on the probe at an obstacle, and against it at a body.
+        let (side, sign) = if at.first.is_some() { (sides[1], -1.0) } else { (sides[0], 1.0) };
+        let Some(side) = side else { continue };
+        let probe = &probes[at.probe];
+        let (root, turning) = (sign * probe.compliance.sqrt(), sign * probe.turning().sqrt());
+        let width = probe.width();
+        for axis in 0..3 {
+            let along = point.axes.row(axis).transpose();
+            let row = &mut work.rows[side.rows + width * axis..][..width];
+            row.iter_mut().zip(&along).for_each(|(x, axis)| *x = root * axis);
+            let turn = at.arm.cross(&along);
+            row.iter_mut().skip(3).zip(&turn).for_each(|(x, axis)| *x = turning * axis);
+        }
+    }
 }
 
 /// What the next step and users need of a contact of a probe. `None` for a memory of a contact
@@ -256,23 +564,25 @@ pub(in super::super) fn keep_at_probe<P: Member>(
     let held = point.pushed[1].hypot(point.pushed[2]);
     let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
     let h = group.h;
-    let x = group.probes[at.probe].position;
+    // The next step holds the material of the place of the probe that is nearest now.
+    let probe = &group.probes[at.probe];
+    let (x, spot) = (probe.ended(&at.nearest.at), at.nearest);
     let (other, on_probe, velocity, compliance, memory) = match &at.first {
         None => {
-            let anchor = if sliding { x + dent } else { point.anchor };
-            let memory = ProbeMemory { other: point.other, force, anchor, place: None };
+            let anchor = if sliding { x + dent } else { point.anchor + (x - at.carried) };
+            let memory = ProbeMemory { other: point.other, force, anchor, spot, place: None };
             (point.other, force, point.carried / h, Matrix3::zeros(), memory)
         }
         Some((place, carriers)) => {
             let view = group.view(point.member);
             let [start, end] = group.shapes(point.member)?;
-            let mut anchor = if sliding { point.end - x + dent } else { point.anchor };
-            // The next step holds the material of the place that is nearest now.
+            let mut anchor = if sliding { point.end - x + dent } else { point.anchor - (x - at.carried) };
+            // It holds the material of the body that is nearest now, too.
             let next = at.last.unwrap_or(*place);
             let of = end.field.carriers(&next);
             anchor += end.material(&next, &of).0 - end.material(place, carriers).0;
             let other = Touched::Body(view.contacts.key);
-            let memory = ProbeMemory { other, force, anchor, place: Some(next) };
+            let memory = ProbeMemory { other, force, anchor, spot, place: Some(next) };
             let way = end.material(&next, &of).0 - start.material(&next, &of).0;
             (other, -force, way / h, point.compliance, memory)
         }
@@ -284,6 +594,7 @@ pub(in super::super) fn keep_at_probe<P: Member>(
         velocity: velocity.into(),
         compliance: std::array::from_fn(|i| std::array::from_fn(|j| compliance[(i, j)])),
         friction: point.friction,
+        spot: spot.at.into(),
         force: on_probe.into(),
         sliding: pushes && sliding,
     };
