@@ -36,6 +36,8 @@ struct TouchSlot {
     /// Height by which the plane lies behind the received one, m, and how fast this decays, m/s.
     lag: f64,
     rate: f64,
+    /// Whether the last update has the plane no more. It then goes away at the rate.
+    leaves: bool,
     /// Where the center of the sphere sticks, m. Set while the plane is touched.
     anchor: Option<Vector3<f64>>,
     /// Force on the tool: along the normal and two tangents, N.
@@ -110,10 +112,13 @@ impl TouchSlot {
     }
 }
 
+/// Room for the planes of an update and for those that leave.
+const SLOTS: usize = 2 * MAX_PLANES;
+
 /// The contact of a tool with the planes of the local model.
 #[derive(Debug, Default)]
 pub(crate) struct Touch {
-    slots: [TouchSlot; MAX_PLANES],
+    slots: [TouchSlot; SLOTS],
     count: usize,
     tick: u64,
     since: f64,
@@ -135,7 +140,8 @@ impl Touch {
 
     /// Takes the planes of a new update. A plane that is touched goes on where it was, and from
     /// there to where the update has it. Another plane in which the tool already is begins at the
-    /// tool, without force.
+    /// tool, without force. A plane that is touched and that the update has no more goes away as
+    /// slowly.
     fn take(&mut self, now: f64, age: f64, model: &LocalModel, held: &Held) {
         let (old, known) = (self.slots, self.count);
         (self.tick, self.since) = (model.tick, now);
@@ -144,7 +150,7 @@ impl Touch {
         for (slot, plane) in self.slots.iter_mut().zip(model.planes()) {
             let last = same(&old[..known], model.planes(), plane);
             let touched = last.filter(|slot| slot.force.x > 0.0);
-            *slot = TouchSlot { plane: *plane, ..touched.copied().unwrap_or_default() };
+            *slot = TouchSlot { plane: *plane, leaves: false, ..touched.copied().unwrap_or_default() };
             let center = held.center(plane);
             let gap = slot.gap(&center, held.radius, 0.0);
             slot.lag = match touched {
@@ -158,6 +164,24 @@ impl Touch {
             if let (Some(anchor), Some(last)) = (&mut slot.anchor, touched) {
                 *anchor += center - held.center(&last.plane);
             }
+        }
+        let loaded = old[..known].iter().filter(|slot| slot.force.x > 0.0);
+        for last in loaded {
+            let goes_on = |plane: &TouchPlane| {
+                same(&old[..known], model.planes(), plane).is_some_and(|slot| std::ptr::eq(slot, last))
+            };
+            if model.planes().iter().any(goes_on) {
+                continue;
+            }
+            let Some(slot) = self.slots.get_mut(self.count) else { break };
+            *slot = TouchSlot { leaves: true, ..*last };
+            let center = held.center(&last.plane);
+            slot.lag += last.gap(&center, held.radius, age) - last.gap(&center, held.radius, 0.0);
+            slot.plane.velocity = [0.0; 3];
+            let (normal, arm) = (Vector3::from(slot.plane.normal), held.arm(&slot.plane));
+            let give = normal.dot(&((slot.compliance() + held.response(&arm)) * normal));
+            slot.rate = slot.force.x * give / interval;
+            self.count += 1;
         }
     }
 
@@ -187,7 +211,8 @@ impl Touch {
         let slots = &mut self.slots[..self.count];
         let mut total = Sum::default();
         for slot in &mut *slots {
-            slot.lag -= slot.lag.clamp(-slot.rate * dt, slot.rate * dt);
+            slot.lag +=
+                if slot.leaves { slot.rate * dt } else { -slot.lag.clamp(-slot.rate * dt, slot.rate * dt) };
             if let Some(anchor) = &mut slot.anchor {
                 *anchor += Vector3::from(slot.plane.velocity) * dt;
                 // A tool that turns takes what touches along, but not the center of its sphere.
@@ -280,4 +305,53 @@ fn same<'a>(old: &'a [TouchSlot], planes: &[TouchPlane], plane: &TouchPlane) -> 
 fn interval(model: &LocalModel) -> f64 {
     let interval = if model.interval > 0.0 { model.interval } else { model.period };
     interval.clamp(0.0, LONGEST)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ToolMap, TouchBall};
+
+    /// A capsule above a floor, led down: the force and the torque are those of its two springs,
+    /// with one end on the floor and with both.
+    #[test]
+    fn a_capsule_on_a_floor_has_the_force_and_the_torque_of_its_springs() {
+        let (stiffness, half, radius, tilt) = (500.0, 0.02, 0.01, 0.1f64);
+        let ball = TouchBall { radius, stiffness, relaxation: 0.0, lever: half };
+        let mut model = LocalModel { ball, interval: 0.01, plane_count: 2, ..LocalModel::default() };
+        for (plane, side) in model.planes.iter_mut().zip([-half, half]) {
+            *plane = TouchPlane { spot: [side, 0.0, 0.0], normal: [0.0, 1.0, 0.0], ..TouchPlane::default() };
+        }
+        let (mut touch, mut tool) = (Touch::default(), Tool::new(ToolMap::default()));
+        let turn = UnitQuaternion::from_scaled_axis(Vector3::z() * tilt);
+        for (height, lies) in [(radius + 0.5 * half * tilt, false), (radius - 0.006, true)] {
+            let mut forces = TouchForces::default();
+            for tick in 0..400 {
+                model.tick = 1 + tick / 10;
+                let at = Vector3::y() * height;
+                tool.update(at, Vector3::zeros(), turn, 0, false);
+                forces = touch.forces(1e-3 * tick as f64, 1e-3, &tool, &model);
+            }
+            let push = (radius - height) * stiffness;
+            // The lower end, `F = k (r + l sin tilt + l turn - y)`, `turn = -F cos tilt / (k l)`.
+            let one = (push + stiffness * half * tilt.sin()) / (1.0 + tilt.cos() * tilt.cos());
+            let (force, torque) = if lies {
+                (push, -stiffness * half * half * tilt.tan())
+            } else {
+                (one, -one * half * tilt.cos())
+            };
+            assert!((forces.elastic.y / force - 1.0).abs() < 1e-3, "{} of {force}", forces.elastic);
+            assert!((forces.torque.z / torque - 1.0).abs() < 1e-2, "{} of {torque}", forces.torque);
+        }
+        // What the simulation touches no more lets go within an update, and not at once.
+        let before = touch.forces(0.4, 1e-3, &tool, &model).elastic.y;
+        (model.tick, model.plane_count) = (100, 0);
+        let mut last = before;
+        for tick in 0..12 {
+            let now = touch.forces(0.4 + 1e-3 * f64::from(tick), 1e-3, &tool, &model).elastic.y;
+            assert!(now <= last + 1e-9 && last - now < 0.25 * before, "{now} N after {last} of {before}");
+            last = now;
+        }
+        assert!(last.abs() < 1e-9, "{last}");
+    }
 }
