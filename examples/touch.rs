@@ -1,10 +1,10 @@
 //! A device's ball, finger or box presses and strokes Pip, without gripping, and slides off onto
 //! the floor.
 //!
-//! What to learn here: [`ToolTouch`] on a tool gives it a ball, and [`ProbeShape`] beside it another
-//! shape. It touches every body and, with the contact plugin, every [`Obstacle`]; the device's loop
-//! closes the contact 1,000 times a second. [`ProbeState`] tells where the tool is, how it is turned
-//! and what it touches. A [`ToolGrip`] beside it grips while the button is down.
+//! What to learn here: [`ToolTouch`] on a tool gives it a ball, and [`ProbeShape`] beside it
+//! another shape. It touches every body and, with the contact plugin, every [`Obstacle`]; the
+//! device's loop closes the contact 1,000 times a second. [`ProbeState`] tells where the tool is,
+//! how it is turned and what it touches. A [`ToolGrip`] beside it grips while the button is down.
 //!
 //! ```sh
 //! cargo run --release --example touch                   # the mouse is the hand; the force is shown

@@ -430,9 +430,9 @@ impl LoopCore {
         supplied
     }
 
-    /// Returns the torque of what the tool holds or touches, reduced as the force was: by `share`, the part of
-    /// the wanted force that was let through, and at most to `gain`. A pure couple wants no force
-    /// and is reduced by `gain` alone.
+    /// Returns the torque of what the tool holds or touches, reduced as the force was: by `share`,
+    /// the part of the wanted force that was let through, and at most to `gain`. A pure couple
+    /// wants no force and is reduced by `gain` alone.
     ///
     /// Beyond that, the torque is only clamped and slewed. Its work is not counted at the port, and
     /// its stiffness is not limited to what the device renders stably. Devices that exert real

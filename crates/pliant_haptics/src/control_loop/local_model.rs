@@ -88,7 +88,8 @@ pub struct LocalModel {
     pub contacts: [ToolContact; MAX_CONTACTS],
     /// Number of grabs that the tool holds.
     pub count: usize,
-    /// The tool's ball or rounding, and the planes that it may touch. The first `plane_count` are in use.
+    /// The tool's ball or rounding, and the planes that it may touch. The first `plane_count` are
+    /// in use.
     pub ball: TouchBall,
     /// See [`ball`](Self::ball).
     pub planes: [TouchPlane; MAX_PLANES],

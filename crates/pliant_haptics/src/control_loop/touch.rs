@@ -1,11 +1,10 @@
 //! Contact at device rate: the planes that the tool touches.
 //!
 //! The simulation publishes what its own probe touches and what is near it as planes
-//! ([`TouchPlane`]), each with the place of the probe. The loop holds a probe of its own by the same
-//! spring and solves the same law of contact with these planes in every period, as
-//! [`pliant_modal::Probe`] does once a step. So the
-//! force is there when the hand meets a surface and gone when it leaves, whatever the rate of the
-//! simulation, and it never pulls.
+//! ([`TouchPlane`]), each with the place of the probe. The loop holds a probe of its own by the
+//! same spring and solves the same law of contact with these planes in every period, as
+//! [`pliant_modal::Probe`] does once a step. So the force is there when the hand meets a surface
+//! and gone when it leaves, whatever the rate of the simulation, and it never pulls.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use pliant_modal::contact_force;
@@ -289,8 +288,8 @@ impl Touch {
     }
 }
 
-/// The old slot of a plane: that of the same body or obstacle whose place of the tool is the nearest
-/// to that of the plane, if no other plane is nearer to it.
+/// The old slot of a plane: that of the same body or obstacle whose place of the tool is the
+/// nearest to that of the plane, if no other plane is nearer to it.
 fn same<'a>(old: &'a [TouchSlot], planes: &[TouchPlane], plane: &TouchPlane) -> Option<&'a TouchSlot> {
     let apart = |a: &TouchPlane, b: &TouchPlane| (Vector3::from(a.spot) - Vector3::from(b.spot)).norm();
     let near = |slot: &&TouchSlot| slot.plane.key == plane.key;

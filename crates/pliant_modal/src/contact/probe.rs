@@ -222,8 +222,8 @@ impl Probe {
     /// Another shape begins its contacts anew.
     ///
     /// # Errors
-    /// Returns [`StepError::Input`] for a number that is not finite, for no points and for more than
-    /// [`Probe::MAX_CORNERS`]. The old shape then stays.
+    /// Returns [`StepError::Input`] for a number that is not finite, for no points and for more
+    /// than [`Probe::MAX_CORNERS`]. The old shape then stays.
     pub fn set_corners(&mut self, corners: &[[f64; 3]]) -> Result<(), StepError> {
         corners.iter().try_for_each(|corner| finite("corner of a probe", corner))?;
         let count = corners.len();
@@ -446,8 +446,9 @@ impl Probe {
     }
 
     /// The place of the probe that is nearest to a surface, from `spot` on and no farther than
-    /// `most` (m), with the probe as it is at the beginning of the step or at its end. `look` returns the outward normal of the
-    /// surface that is nearest to a point (m, world axes), if any is near.
+    /// `most` (m), with the probe as it is at the beginning of the step or at its end. `look`
+    /// returns the outward normal of the surface that is nearest to a point (m, world axes), if any
+    /// is near.
     ///
     /// A step leads towards the corner that lies lowest along the normal, to where the distance
     /// grows again.
