@@ -311,7 +311,7 @@ fn a_modal_file_loads_and_one_that_is_cut_altered_or_of_another_version_says_why
         ("cut", bytes[..bytes.len() / 2].to_vec(), "cut or padded .modal file"),
         ("altered", altered(bytes.len() - 9, 1), "altered"),
         ("newer", altered(8, 7), "version"),
-        ("empty", Vec::new(), "cut"),
+        ("empty", Vec::new(), "expected it to begin with"),
         (
             "other",
             b"solid not a model at all, but long enough to have a header of its own".repeat(4),
