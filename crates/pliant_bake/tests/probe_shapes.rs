@@ -121,6 +121,30 @@ fn a_box_stands_on_its_face_and_on_its_edge() {
     assert!((torque.z / want - 1.0).abs() < 1e-6 && torque.z < -1e-3, "{torque}");
 }
 
+/// A capsule that is longer than the box below it, and exactly along it, lies on it.
+#[test]
+fn a_capsule_lies_on_a_box_that_is_narrower() {
+    let beam =
+        Cuboid { center: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0], half: [0.01, 0.02, 0.02], round: 0.0 };
+    let mut probes = on(beam, capsule(Vector3::new(0.0, 0.05, 0.0)));
+    rest(&mut probes, 2);
+    let mut islands = Islands::default();
+    for k in 0..=270 {
+        probes[0].set_target([0.0, 0.05 - 1e-4 * f64::from(k), 0.0]).unwrap();
+        step(&mut islands, &mut [], &mut probes, 60.0);
+    }
+    rest(&mut probes, 60);
+    let (f, x) = (force(&probes[0]), Vector3::from(probes[0].position()));
+    println!("{f:?} N at {x:?}");
+    assert!((f.y / (STIFFNESS * 0.002) - 1.0).abs() < 5e-3 && (x.y - 0.025).abs() < 1e-4, "{f} {x}");
+    // Corners in one place are one, and a short thick tool does not turn about itself.
+    let mut twin = probe(RADIUS, Vector3::new(0.0, 0.1, 0.0));
+    twin.set_corners(&[[0.0; 3], [1e-4, 0.0, 0.0]]).unwrap();
+    assert_eq!(twin.lever(), 0.0);
+    twin.set_corners(&[[1e-3, 0.0, 0.0]]).unwrap();
+    assert_eq!(twin.lever(), RADIUS);
+}
+
 /// Between its ends a capsule touches a sphere, which passes below it without a bump.
 #[test]
 fn a_capsule_strokes_a_sphere_without_a_bump() {

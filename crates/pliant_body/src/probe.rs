@@ -25,7 +25,8 @@ pub struct TouchProbe {
     /// To where the spring turns the probe, from own to world axes. Default: not turned.
     pub rotation: DQuat,
     /// Stiffness of the spring, N/m, above 0. Against a turn it is this times the square of the
-    /// farthest corner's distance from the tool point. Default: `500`.
+    /// farthest corner's distance from the tool point, which counts as the radius at least.
+    /// Default: `500`.
     pub stiffness: f64,
     /// Relaxation time of the damper beside the spring, s, 0 or more. Default: `0.001`.
     pub relaxation: f64,
@@ -173,6 +174,11 @@ impl ProbeState {
     /// Distance of the farthest point of the shape from the tool point, m.
     pub fn extent(&self) -> f64 {
         self.probe.as_ref().map_or(0.0, |probe| probe.extent() * self.scale)
+    }
+
+    /// The length whose square times the stiffness resists a turn, m: that of [`Probe::lever`].
+    pub fn lever(&self) -> f64 {
+        self.probe.as_ref().map_or(0.0, |probe| probe.lever() * self.scale)
     }
 
     /// Center (m, world axes) around which obstacles count, and the scale of their shapes.

@@ -323,7 +323,7 @@ impl LoopCore {
         }
         let fresh = self.good && self.received_tick > 0;
         let mut holding = fresh && model.count > 0;
-        // Planes that an update has no more go away as it says, and not at once.
+        // Planes that an update has no more go away until the next one, and not at once.
         let touching = fresh && !holding && (model.plane_count > 0 || self.touch.touches());
         let silent = if holding || touching { (now - self.received_at).max(0.0) } else { 0.0 };
 

@@ -62,9 +62,8 @@ pub struct TouchBall {
     /// Stiffness of the spring from the tool to what touches, N/m of the world. With 0 it touches
     /// nothing.
     pub stiffness: f64,
-    /// Distance of the farthest corner of the shape from the tool point, m of the world. The
-    /// stiffness against a turn is that of the spring times its square. Zero of a ball, which does
-    /// not turn.
+    /// The length whose square times the stiffness resists a turn, m of the world
+    /// ([`Probe::lever`](pliant_modal::Probe::lever)). Zero of a ball, which does not turn.
     pub lever: f64,
     /// Relaxation time of the damper beside the spring, s.
     pub relaxation: f64,

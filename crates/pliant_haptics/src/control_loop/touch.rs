@@ -146,8 +146,9 @@ impl Touch {
         (self.tick, self.since) = (model.tick, now);
         self.count = model.planes().len();
         let interval = interval(model).max(1e-3);
-        for (slot, plane) in self.slots.iter_mut().zip(model.planes()) {
-            let last = same(&old[..known], model.planes(), plane);
+        let of = matches(&old[..known], model.planes());
+        for ((slot, plane), of) in self.slots.iter_mut().zip(model.planes()).zip(of) {
+            let last = of.and_then(|of| old.get(of));
             let touched = last.filter(|slot| slot.force.x > 0.0);
             *slot = TouchSlot { plane: *plane, leaves: false, ..touched.copied().unwrap_or_default() };
             let center = held.center(plane);
@@ -164,12 +165,9 @@ impl Touch {
                 *anchor += center - held.center(&last.plane);
             }
         }
-        let loaded = old[..known].iter().filter(|slot| slot.force.x > 0.0);
-        for last in loaded {
-            let goes_on = |plane: &TouchPlane| {
-                same(&old[..known], model.planes(), plane).is_some_and(|slot| std::ptr::eq(slot, last))
-            };
-            if model.planes().iter().any(goes_on) {
+        let loaded = old[..known].iter().enumerate().filter(|(_, slot)| slot.force.x > 0.0);
+        for (number, last) in loaded {
+            if of.contains(&Some(number)) {
                 continue;
             }
             let Some(slot) = self.slots.get_mut(self.count) else { break };
@@ -188,7 +186,8 @@ impl Touch {
     ///
     /// The tool point is at `x + sum f / k` for a tool at `x` and the forces `f` of the planes, and
     /// the torque of these turns the tool against `k l^2`. Each force obeys the law of contact with
-    /// the dent of its plane.
+    /// the dent of its plane. The damper knows how fast the tool point goes, and not how fast the
+    /// tool turns.
     pub(crate) fn forces(&mut self, now: f64, dt: f64, tool: &Tool, model: &LocalModel) -> TouchForces {
         let ball = &model.ball;
         let soft = if ball.stiffness > 0.0 { 1.0 / ball.stiffness } else { 0.0 };
@@ -214,9 +213,11 @@ impl Touch {
                 if slot.leaves { slot.rate * dt } else { -slot.lag.clamp(-slot.rate * dt, slot.rate * dt) };
             if let Some(anchor) = &mut slot.anchor {
                 *anchor += Vector3::from(slot.plane.velocity) * dt;
-                // A tool that turns takes what touches along, but not the center of its sphere.
-                let below = -held.radius * Vector3::from(slot.plane.normal);
-                *anchor -= turned * below - below;
+                if turning > 0.0 {
+                    // A tool that turns takes what touches along, but not the center of its sphere.
+                    let below = -held.radius * Vector3::from(slot.plane.normal);
+                    *anchor -= turned * below - below;
+                }
             }
             total.add(&slot.axes().tr_mul(&slot.force), &held.arm(&slot.plane));
         }
@@ -242,6 +243,7 @@ impl Touch {
                 break;
             }
         }
+        let pushed: f64 = slots.iter().map(|slot| slot.force.x.max(0.0)).sum();
         for slot in slots {
             if slot.force.x <= 0.0 {
                 (slot.anchor, slot.force) = (None, Vector3::zeros());
@@ -263,7 +265,8 @@ impl Touch {
             // in the cone.
             let normal = Vector3::from(slot.plane.normal);
             let give = (slot.compliance() + held.response(&arm)) * normal;
-            let damping = ball.relaxation / normal.dot(&give);
+            // Beside others it has a share of the damper.
+            let damping = slot.force.x / pushed * ball.relaxation / normal.dot(&give);
             let mut drag = axes * (Vector3::from(slot.plane.velocity) - tool.velocity) * damping;
             drag.x = drag.x.clamp(-slot.force.x, slot.force.x);
             let normal = slot.force.x + drag.x;
@@ -288,16 +291,24 @@ impl Touch {
     }
 }
 
-/// The old slot of a plane: that of the same body or obstacle whose place of the tool is the
-/// nearest to that of the plane, if no other plane is nearer to it.
-fn same<'a>(old: &'a [TouchSlot], planes: &[TouchPlane], plane: &TouchPlane) -> Option<&'a TouchSlot> {
-    let apart = |a: &TouchPlane, b: &TouchPlane| (Vector3::from(a.spot) - Vector3::from(b.spot)).norm();
-    let near = |slot: &&TouchSlot| slot.plane.key == plane.key;
-    let nearest = |a: &&TouchSlot, b: &&TouchSlot| apart(&a.plane, plane).total_cmp(&apart(&b.plane, plane));
-    let slot = old.iter().filter(near).min_by(nearest)?;
-    let own = apart(&slot.plane, plane);
-    let nearer = |other: &TouchPlane| other.key == plane.key && apart(other, &slot.plane) < own;
-    (!planes.iter().any(nearer)).then_some(slot)
+/// The old slot of each plane: that of the same body or obstacle whose place of the tool is the
+/// nearest to that of the plane.
+fn matches(old: &[TouchSlot], planes: &[TouchPlane]) -> [Option<usize>; MAX_PLANES] {
+    let mut of = [None; MAX_PLANES];
+    loop {
+        let mut nearest: Option<(f64, usize, usize)> = None;
+        for (new, plane) in planes.iter().enumerate().filter(|(new, _)| of[*new].is_none()) {
+            for (known, slot) in old.iter().enumerate() {
+                let apart = (Vector3::from(slot.plane.spot) - Vector3::from(plane.spot)).norm();
+                let same = slot.plane.key == plane.key;
+                if same && !of.contains(&Some(known)) && nearest.is_none_or(|(least, ..)| apart < least) {
+                    nearest = Some((apart, new, known));
+                }
+            }
+        }
+        let Some((_, new, known)) = nearest else { return of };
+        of[new] = Some(known);
+    }
 }
 
 /// Time for which a plane goes on with its velocity, and in which it is corrected, s.
@@ -310,6 +321,22 @@ fn interval(model: &LocalModel) -> f64 {
 mod tests {
     use super::*;
     use crate::{ToolMap, TouchBall};
+
+    /// A ball that sticks does not rub when the hand turns.
+    #[test]
+    fn a_ball_does_not_turn() {
+        let ball = TouchBall { radius: 0.01, stiffness: 500.0, relaxation: 0.0, lever: 0.0 };
+        let mut model = LocalModel { ball, interval: 0.01, plane_count: 1, ..LocalModel::default() };
+        model.planes[0] = TouchPlane { normal: [0.0, 1.0, 0.0], friction: 0.5, ..TouchPlane::default() };
+        let (mut touch, mut tool) = (Touch::default(), Tool::new(ToolMap::default()));
+        for tick in 0..200 {
+            model.tick = 1 + tick / 10;
+            let turn = UnitQuaternion::from_scaled_axis(Vector3::x() * (1e-3 * tick as f64));
+            tool.update(Vector3::y() * 0.006, Vector3::zeros(), turn, 0, false);
+            let forces = touch.forces(1e-3 * tick as f64, 1e-3, &tool, &model);
+            assert!(forces.elastic.xz().norm() < 1e-9, "{}", forces.elastic);
+        }
+    }
 
     /// A capsule above a floor, led down: the force and the torque are those of its two springs,
     /// with one end on the floor and with both.

@@ -176,7 +176,7 @@ pub(crate) fn publish(
                 radius: probe.radius,
                 stiffness: probe.stiffness,
                 relaxation: probe.relaxation,
-                lever: (state.extent() - probe.radius).max(0.0),
+                lever: state.lever(),
             };
             // What pushes comes first, if there are more than the loop has room for.
             let mut touched: Vec<Touching> = state.contacts().collect();

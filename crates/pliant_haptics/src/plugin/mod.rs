@@ -116,7 +116,7 @@ impl Plugin for HapticsPlugin {
             )
             .add_systems(
                 self.schedule,
-                (tool::update_tools, tool::lead_balls).chain().in_set(HapticSystems::Move),
+                (tool::update_tools, tool::lead_probes).chain().in_set(HapticSystems::Move),
             )
             .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::LocalModel));
         #[cfg(feature = "gamepad")]

@@ -234,10 +234,10 @@ pub(crate) fn update_tools(
     }
 }
 
-/// Before a tick: leads the balls of the tools that touch. A ball begins where its tool is, and not
-/// where a loop says that does not know its workspace yet: it would be caught there. Where a
-/// workspace jumps, its ball begins anew.
-pub(crate) fn lead_balls(
+/// Before a tick: leads the probes of the tools that touch. A probe begins where its tool is, and
+/// not where a loop says that does not know its workspace yet: it would be caught there. Where a
+/// workspace jumps, its probe begins anew.
+pub(crate) fn lead_probes(
     mut devices: ResMut<HapticDevices>,
     mut tools: Query<(&HapticTool, &ToolPose, &ToolTouch, Option<&ToolGrabs>, &mut TouchProbe)>,
 ) {

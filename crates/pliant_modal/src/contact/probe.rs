@@ -26,8 +26,8 @@ const SLIDES: usize = 4;
 pub struct ProbeConfig {
     /// Radius of the ball, or by which the shape is rounded, m, above 0.
     pub radius: f64,
-    /// Stiffness of the spring to the target, N/m, above 0. That against a turn is
-    /// this times the square of the farthest corner's distance from the tool point, N m.
+    /// Stiffness of the spring to the target, N/m, above 0. That against a turn is this times the
+    /// square of [`Probe::lever`], N m.
     pub stiffness: f64,
     /// Relaxation time of the damper beside the spring, its damping over the stiffness, s, 0 or
     /// more.
@@ -129,12 +129,13 @@ pub(crate) struct ProbeMemory {
 /// ```
 ///
 /// with the stiffness `k`, the relaxation time `r` and the step `h`. In the same way the torque
-/// about that point turns it against `k l^2`, with the distance `l` of the farthest corner: a force
-/// on that corner moves it by the turn as far as by the way. A ball does not turn.
-/// [`Islands::step_with`](crate::Islands::step_with) solves this with all contacts of the step, so
-/// the forces on a body and on the probe are equal and opposite, and the probe stays on the surface
-/// while the target goes in. It touches each body and each obstacle with the corners that are near,
-/// and with the place between them that is nearest.
+/// about that point turns it against `k l^2`, with the distance `l` of the farthest corner
+/// ([`Probe::lever`]): a force on that corner moves it by the turn as far as by the way. A ball
+/// does not turn. [`Islands::step_with`](crate::Islands::step_with) solves this with all contacts
+/// of the step, so the forces on a body and on the probe are equal and opposite, and the probe
+/// stays on the surface while the target goes in. It touches each body and each obstacle with the
+/// corners that are near, and with the place between them that is nearest; each body also with
+/// places between the corners, one for each of its sites.
 #[derive(Debug, Clone)]
 pub struct Probe {
     config: ProbeConfig,
@@ -142,8 +143,10 @@ pub struct Probe {
     /// The corners, and then the places between them at which the search begins, m, own axes.
     seeds: Vec<Vector3<f64>>,
     corners: usize,
+    /// The corners as they were given, m, own axes.
+    shape: Vec<[f64; 3]>,
     /// Distance of the farthest corner from the tool point, m. Zero of a ball.
-    lever: f64,
+    farthest: f64,
     target: Vector3<f64>,
     last_target: Option<Vector3<f64>>,
     pub(crate) position: Vector3<f64>,
@@ -183,7 +186,8 @@ impl Probe {
             obstacles: Vec::new(),
             seeds: vec![Vector3::zeros()],
             corners: 1,
-            lever: 0.0,
+            shape: vec![[0.0; 3]],
+            farthest: 0.0,
             target,
             last_target: None,
             position: target,
@@ -213,7 +217,11 @@ impl Probe {
     /// Returns the errors of [`Probe::new`]. The old settings then stay.
     pub fn configure(&mut self, config: ProbeConfig) -> Result<(), StepError> {
         config.check()?;
+        let other = config.radius != self.config.radius;
         self.config = config;
+        if other && self.shape.len() > 1 {
+            self.plant();
+        }
         Ok(())
     }
 
@@ -229,12 +237,27 @@ impl Probe {
         let count = corners.len();
         let some = (1..=Self::MAX_CORNERS).contains(&count);
         StepError::check("number of corners of a probe", "1 to 16", some, count as f64)?;
-        let corners: Vec<_> = corners.iter().map(|corner| Vector3::from(*corner)).collect();
-        if self.corners() == corners {
-            return Ok(());
+        if self.shape != corners {
+            self.shape.clear();
+            self.shape.extend_from_slice(corners);
+            self.plant();
         }
-        (self.seeds, self.corners) = (corners, count);
-        self.lever = self.seeds.iter().map(Vector3::norm).fold(0.0, f64::max);
+        Ok(())
+    }
+
+    /// Finds the places that stay, and begins the contacts anew.
+    fn plant(&mut self) {
+        let apart = SAME * self.config.radius;
+        self.seeds.clear();
+        for corner in self.shape.iter().map(|corner| Vector3::from(*corner)) {
+            // Corners in one place are one.
+            if !self.seeds.iter().any(|other| (other - corner).norm() < apart) {
+                self.seeds.push(corner);
+            }
+        }
+        let count = self.seeds.len();
+        self.corners = count;
+        self.farthest = self.seeds.iter().map(Vector3::norm).fold(0.0, f64::max);
         let pairs = count * (count - 1) / 2;
         let most = if pairs == 0 { 0 } else { ((MAX_SEEDS - count) / pairs).clamp(1, MAX_BETWEEN) };
         for a in 0..count {
@@ -244,16 +267,18 @@ impl Probe {
                 let parts = between.min(most) + 1;
                 for k in 1..parts {
                     let seed = from + way * (k as f64 / parts as f64);
-                    let near = |other: &Vector3<f64>| (other - seed).norm() < SAME * self.config.radius;
                     // The middles of the diagonals of a box are one.
+                    let near = |other: &Vector3<f64>| (other - seed).norm() < apart;
                     if self.seeds.len() < MAX_SEEDS && !self.seeds.iter().any(near) {
                         self.seeds.push(seed);
                     }
                 }
             }
         }
+        let room = self.seeds.len() + 1;
+        self.contacts.reserve(room);
+        self.memory.reserve(room);
         self.forget();
-        Ok(())
     }
 
     /// The corners, m from the tool point, own axes.
@@ -272,7 +297,7 @@ impl Probe {
     }
 
     /// Moves the target of the spring (m, world axes). A target faster than 100 m/s is a teleport:
-    /// the ball is then at the target, and its contacts begin anew.
+    /// the probe is then at the target, and its contacts begin anew.
     ///
     /// # Errors
     /// Returns [`StepError::Input`] for a target that is not finite. The old one then stays.
@@ -303,8 +328,8 @@ impl Probe {
         self.target.into()
     }
 
-    /// Sets the rigid obstacles that the ball touches. Contacts with an obstacle go on with the one
-    /// at the same index of the new list.
+    /// Sets the rigid obstacles that the probe touches. Contacts with an obstacle go on with the
+    /// one at the same index of the new list.
     ///
     /// # Errors
     /// Returns the error of [`ObstacleShape::check`]. The old obstacles then stay.
@@ -331,10 +356,21 @@ impl Probe {
 
     /// Distance of the farthest point of the shape from the tool point, m.
     pub fn extent(&self) -> f64 {
-        self.lever + self.config.radius
+        self.farthest + self.config.radius
     }
 
-    /// What the ball touches and what is near it, after a step.
+    /// The length whose square times the stiffness resists a turn, m: the distance of the farthest
+    /// corner from the tool point, or the radius if that is more. Zero of a ball, which does not
+    /// turn.
+    pub fn lever(&self) -> f64 {
+        if self.turns() { self.farthest.max(self.config.radius) } else { 0.0 }
+    }
+
+    fn turns(&self) -> bool {
+        self.farthest > 0.0
+    }
+
+    /// What the probe touches and what is near it, after a step.
     pub fn contacts(&self) -> &[ProbeContact] {
         &self.contacts
     }
@@ -366,8 +402,9 @@ impl Probe {
     /// Begins a step of `h` seconds. Returns how far a point of the probe may go in it, m.
     pub(crate) fn begin_step(&mut self, h: f64) -> f64 {
         let last = self.last_target.unwrap_or(self.target);
-        let turned = self.turned.angle_to(&self.last_turned);
-        if self.last_target.is_none() || (self.target - last).norm().max(turned) > TELEPORT * h {
+        // No turn is by more than half of one.
+        let turned = self.turns() && self.turned.angle_to(&self.last_turned) > (TELEPORT * h).min(3.0);
+        if self.last_target.is_none() || turned || (self.target - last).norm() > TELEPORT * h {
             self.forget();
         }
         let stretch = self.position - self.last_target.unwrap_or(self.target);
@@ -379,14 +416,14 @@ impl Probe {
         self.last_target = Some(self.target);
         let way = (self.free - self.start).norm();
         self.start_rotation = self.rotation;
-        if self.lever > 0.0 {
+        if self.turns() {
             let stretch = (self.rotation * self.last_turned.inverse()).scaled_axis();
             self.free_rotation = UnitQuaternion::from_scaled_axis(stretch * left) * self.turned;
         } else {
             self.free_rotation = self.turned;
         }
         self.last_turned = self.turned;
-        way + self.lever * self.free_rotation.angle_to(&self.start_rotation)
+        way + self.farthest * self.free_rotation.angle_to(&self.start_rotation)
     }
 
     /// Moves the probe to where a force on it (N, world axes) and its torque about the tool point
@@ -399,17 +436,17 @@ impl Probe {
 
     /// Sets the torque of the step. A ball has none.
     pub(crate) fn set_torque(&mut self, torque: Vector3<f64>) {
-        self.torque = if self.lever > 0.0 { torque } else { Vector3::zeros() };
+        self.torque = if self.turns() { torque } else { Vector3::zeros() };
     }
 
     /// Number of the coordinates of the spring in a solve.
     pub(crate) fn width(&self) -> usize {
-        if self.lever > 0.0 { 6 } else { 3 }
+        if self.turns() { 6 } else { 3 }
     }
 
     /// Turn for a torque, rad/(N m).
     pub(crate) fn turning(&self) -> f64 {
-        if self.lever > 0.0 { self.compliance / (self.lever * self.lever) } else { 0.0 }
+        if self.turns() { self.compliance / self.lever().powi(2) } else { 0.0 }
     }
 
     /// Whether all numbers are finite.
@@ -419,12 +456,12 @@ impl Probe {
 
     /// Center of the sphere at a place, m, world axes, at the beginning of the step.
     pub(crate) fn begun(&self, spot: &Vector3<f64>) -> Vector3<f64> {
-        if self.lever > 0.0 { self.start + self.start_rotation * spot } else { self.start }
+        if self.turns() { self.start + self.start_rotation * spot } else { self.start }
     }
 
     /// Center of the sphere at a place, m, world axes, at the end of the computed step.
     pub(crate) fn ended(&self, spot: &Vector3<f64>) -> Vector3<f64> {
-        if self.lever > 0.0 { self.position + self.rotation * spot } else { self.position }
+        if self.turns() { self.position + self.rotation * spot } else { self.position }
     }
 
     /// From the tool point to where a surface with this outward normal touches the sphere at a
@@ -437,7 +474,7 @@ impl Probe {
     /// Where the sphere's center would be at the end of the step if it had gone as the material of
     /// the probe that touches, m, world axes.
     pub(crate) fn carried(&self, spot: &Vector3<f64>, normal: &Vector3<f64>) -> Vector3<f64> {
-        if self.lever <= 0.0 {
+        if !self.turns() {
             return self.position;
         }
         let [arm, _] = self.arms(spot, normal);
@@ -501,7 +538,7 @@ impl Probe {
     }
 }
 
-/// An obstacle around which the ball's center moves.
+/// An obstacle around which the center of a sphere moves.
 #[derive(Debug)]
 pub(crate) struct Grown<'a> {
     pub(crate) shape: &'a dyn ObstacleShape,

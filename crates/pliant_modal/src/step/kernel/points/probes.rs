@@ -261,7 +261,7 @@ fn unite<P: Member>(group: &Group<'_, P>, work: &mut Touching) {
 }
 
 /// Rise of a surface beside the place of a probe that is nearest to it, as a share of the radius,
-/// below which it is flat there: the corners are enough.
+/// below which it is flat there: what touches already is enough.
 const FLAT: f64 = 1e-3;
 
 /// Whether a surface falls away from a place between the corners of a probe towards all of them.
@@ -315,7 +315,7 @@ fn detect_at_obstacle<P: Member>(
         let mut point = at_obstacle(probe, (index, span), at, obstacle, spot, &found);
         point.carried = carried(obstacle, &to, group.h)?;
         point.gap = look(&grown, &(from + point.carried))?.distance;
-        let slid = to - from - point.carried;
+        let slid = probe.carried(&spot.at, &found.normal) - from - point.carried;
         point.anchor = from + point.carried + share(point.gap, found.distance) * slid;
         point.passed = passed;
         if let Some(side) = &mut point.probe {
@@ -350,7 +350,7 @@ fn detect_at_obstacle<P: Member>(
         let alone = !work.points.iter().any(|point| is_at_obstacle(point, span, at));
         let distance = |x: &Vector3<f64>| Ok(Some(look(&grown, x)?.distance));
         let near = found.distance < radius && !taken;
-        if near && (if passed { alone } else { is_summit(probe, &spot, found.distance, distance)? }) {
+        if near && (alone || !passed && is_summit(probe, &spot, found.distance, distance)?) {
             add(work, spot, found, passed)?;
         }
     }
@@ -381,13 +381,13 @@ fn detect_at_body<P: Member>(
     };
     let mut penetrates = false;
     let mut add = |work: &mut Touching, spot: Spot, near: &Near, passed: bool| {
-        let [from, to] = [probe.begun(&spot.at), probe.ended(&spot.at)];
+        let from = probe.begun(&spot.at);
         let begun = start.at(&near.place, &from);
         let mut point = at_body(&view, &start, member, &near.place, (probe, (index, span), spot), &begun);
         point.gap = begun.distance - radius;
         point.passed = passed;
         let ended = end.material(&near.place, &end.field.carriers(&near.place)).0;
-        let slid = (ended - point.start) - (to - from);
+        let slid = (ended - point.start) - (probe.carried(&spot.at, &near.normal) - from);
         point.anchor = point.start - from + share(point.gap, near.distance - radius) * slid;
         point.turn(&-near.normal);
         if probe.is_between(&spot) && shares_site(work, &point) {
@@ -463,7 +463,7 @@ pub(super) fn linearize_at_probe<P: Member>(
             let Touched::Obstacle(index) = point.other else { return Ok(()) };
             let Some(obstacle) = probe.obstacles().get(index) else { return Ok(()) };
             if !far {
-                at.nearest = slide(probe, &at.nearest, true, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
+                at.nearest = slide(probe, &at.spot, true, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
             }
             let x = probe.ended(&at.nearest.at);
             if !far {
@@ -483,7 +483,7 @@ pub(super) fn linearize_at_probe<P: Member>(
             let mut last = at.last.unwrap_or(*place);
             let within = reach(radius, shape.size);
             if !far {
-                at.nearest = slide(probe, &at.nearest, true, |x| {
+                at.nearest = slide(probe, &at.spot, true, |x| {
                     Ok(normal_of(shape.nearest(x, within, Some(&last)), &mut last))
                 })?;
             }
