@@ -259,7 +259,7 @@ impl Probe {
         self.corners = count;
         self.farthest = self.seeds.iter().map(Vector3::norm).fold(0.0, f64::max);
         let pairs = count * (count - 1) / 2;
-        let most = if pairs == 0 { 0 } else { ((MAX_SEEDS - count) / pairs).clamp(1, MAX_BETWEEN) };
+        let most = (MAX_SEEDS - count).checked_div(pairs).map_or(0, |most| most.clamp(1, MAX_BETWEEN));
         for a in 0..count {
             for b in a + 1..count {
                 let (from, way) = (self.seeds[a], self.seeds[b] - self.seeds[a]);
