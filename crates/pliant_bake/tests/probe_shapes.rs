@@ -6,7 +6,9 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector, UnitQuaternion, Vector3};
 use pliant_bake::{BakeConfig, DeadLoad, StaticLoads, deflect};
 use pliant_mesh::{TetMesh, shapes};
-use pliant_modal::{Cuboid, Islands, ModalModel, ObstacleShape, Patch, Plane, Probe, ProbeConfig, Sphere};
+use pliant_modal::{
+    Cuboid, Islands, ModalModel, ObstacleShape, Patch, Plane, Probe, ProbeConfig, Sphere, Together,
+};
 
 use super::probe::{STIFFNESS, block, body, force, model, probe, step, top};
 
@@ -347,6 +349,30 @@ fn shapes_are_calm_in_wild_hands() {
             }
             println!("shape {shape} at {rate} Hz: {worst:.2} of what 0.1 m of the spring give at most");
             assert!(worst < 20.0);
+        }
+    }
+    // Sizes beyond all measure, beside a body and a floor.
+    for radius in [1e-300, 1e-9, 0.01, 1e9, 1e150] {
+        for far in [1e-300, 1e-160, 1.0, 1e9, 1e160, 1e300] {
+            let mut probes = on(Plane::GROUND, probe(0.01, at));
+            let config = ProbeConfig { radius, ..*probes[0].config() };
+            probes[0].configure(config).unwrap();
+            probes[0].set_corners(&[[-far, 0.0, 0.0], [far, 0.0, far]]).unwrap();
+            let mut bodies = [body(&soft, 60.0)];
+            let mut islands = Islands::default();
+            for k in 0..10 {
+                probes[0].set_target((at + Vector3::new(0.0, -0.002 * f64::from(k), 0.0)).into()).unwrap();
+                probes[0].set_rotation(turned(Vector3::new(0.1, 0.2, 0.3) * f64::from(k))).unwrap();
+                // A step may fail, and is told; what is kept is finite.
+                let mut all = [Together::new(7, &mut bodies[0])];
+                islands.step_with(&mut all, &mut probes, 1.0 / 60.0, |_, _| true, |_, _| true);
+                let x = Vector3::from(probes[0].position());
+                let all = x.iter().chain(bodies[0].q()).all(|x| x.is_finite());
+                assert!(all && probes[0].rotation().iter().all(|x| x.is_finite()), "{radius:e} {far:e} {x}");
+                // A ball as large as the sun begins around the body, and its spring is as long.
+                let energy = bodies[0].energy();
+                assert!(energy < 10.0 || radius > 1.0 || far > 10.0, "{radius:e} {far:e}: {energy} J");
+            }
         }
     }
     let mut probe = probe(0.01, at);
