@@ -4,6 +4,7 @@
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
 mod checks;
+mod defaults;
 mod networks;
 mod page;
 mod programs;

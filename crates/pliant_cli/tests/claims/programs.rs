@@ -117,6 +117,24 @@ fn a_ball_that_bounces_is_told_as_it_was_measured() {
     let its_times = range(&of(false, 1e3, "contact_ms"));
     says_range(DECISIONS, "Rapier, MuJoCo and PyBullet are within", its_times);
     says_range(DECISIONS, "are within 10.5 to 15 ms and", range(&shares(false)));
+    // Each of theirs over each of ours, at as many steps and of as many tetrahedra.
+    let ratios = |steps: f64| -> Vec<(String, f64)> {
+        let at: Vec<&Vec<String>> = rows.iter().filter(|row| cell(row, "steps_a_second") == steps).collect();
+        let ms = |row: &[String]| cell(row, "ms_a_second");
+        let (ours, theirs): (Vec<_>, Vec<_>) = at.into_iter().partition(|row| row[0].starts_with("Pliant"));
+        let both = theirs.iter().flat_map(|its| ours.iter().map(move |own| (its, own)));
+        let alike = both.filter(|(its, own)| its[1] == own[1]);
+        alike.map(|(its, own)| (its[0].clone(), ms(its) / ms(own))).collect()
+    };
+    let worth = |all: &[(String, f64)]| range(&all.iter().map(|ratio| ratio.1).collect::<Vec<_>>());
+    let (thousand, most) = (ratios(1e3), ratios(16e3));
+    assert!(thousand.iter().all(|ratio| !ratio.0.starts_with("PyBullet")), "it has no run there");
+    assert!(most.iter().all(|ratio| ratio.0.starts_with("PyBullet")), "it alone has runs there");
+    let [least_times, most_times] = worth(&thousand);
+    says(DECISIONS, "At 1,000 steps Rapier and MuJoCo take", least_times);
+    // Told in hundreds.
+    says(DECISIONS, "Rapier and MuJoCo take 17 to", (most_times / 100.0).round() * 100.0);
+    says_range(DECISIONS, "runs at 16,000 only and takes", worth(&most));
     let linear = |steps: f64| {
         let row = rows.iter().find(|row| row[0] == "Pliant, linear" && cell(row, "steps_a_second") == steps);
         cell(row.unwrap(), "height_percent")
