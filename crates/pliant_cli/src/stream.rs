@@ -24,7 +24,7 @@ use crate::{CliError, output};
 
 #[derive(Args, Debug)]
 #[command(
-    after_help = "hand_to_force_ms is measured between peers: the longest time from a position of the own hand to the first step whose force has it. Else it is reckoned: for force-driven repair one step by construction, as the own copy answers at its next step; for the others half the measured round trip, half a step and the measured delay of showing. visual_delay_ms is the mean time from the host's step to the showing of its tick, and between peers the mean age of the newest tick of which all targets are known."
+    after_help = "hand_to_force_ms is measured between peers: the longest time from a position of the own hand to the first step whose force has it. With a repair that the guest's own copy answers (default, force-driven) it is not measured, and has no number: that copy answers at its next step. For the others it is reckoned: half the measured round trip, half a step and the measured delay of showing. visual_delay_ms is the mean time from the host's step to the showing of its tick, and between peers the mean age of the newest tick of which all targets are known."
 )]
 pub(crate) struct StreamArgs {
     /// The body
@@ -250,7 +250,7 @@ fn table(all: &[StreamMetrics]) -> String {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{:<14} {:>7} {:>6} {:>9} {:>11.4} {:>11.3} {:>11.2e} {:>10.3} {:>8.3} {:>9.0} {:>8.0} {:>8.1} {:>7.1}",
+            "{:<14} {:>7} {:>6} {:>9} {:>11.4} {:>11.3} {:>11.2e} {:>10.3} {:>8.3} {:>9} {:>8.0} {:>8.1} {:>7.1}",
             t.recovery,
             t.ticks,
             t.lost,
@@ -260,14 +260,14 @@ fn table(all: &[StreamMetrics]) -> String {
             t.end_percent,
             t.force_rms_percent,
             t.force_ringing,
-            t.hand_to_force_ms,
+            if t.hand_to_force_ms.is_nan() { "-".to_owned() } else { format!("{:.0}", t.hand_to_force_ms) },
             t.visual_delay_ms,
             t.kbit_s,
             t.cpu_us_per_tick
         );
     }
     text.push_str(
-        "hand ms is measured between peers and reckoned for the others; late ms is the age of what is shown (see --help)",
+        "hand ms is measured between peers, not where an own copy answers (-), and else reckoned; late ms is the age of what is shown (see --help)",
     );
     text
 }

@@ -17,7 +17,7 @@ fn table_2_has_our_own_body_for_what_is_not_there() {
     assert_eq!(number(0, 1), 1_080.0);
     for (row, tets) in [(1, 50_000.0), (2, 49_729.0), (3, 100_000.0)] {
         let share = number(row, 1) / (tets / 40.0);
-        assert!((0.5..2.0).contains(&share), "{row}: {share} of the tetrahedra asked for");
+        assert!((0.95..1.06).contains(&share), "{row}: {share} of the tetrahedra asked for");
     }
     for (row, paper) in [1124.2, 264.2, 134.8, 56.8].into_iter().enumerate() {
         // A frame is a step and a surface. The steps a second are those of the median frame, and
@@ -41,7 +41,7 @@ fn what_compensation_adds_is_measured_on_our_own_body() {
         let (without, with, times) = (number(2), number(3), number(4));
         // The medians of the times and of the ratios are not of the same session, and the largest
         // and the least ratio have the median between them.
-        assert!(without > 0.0 && (0.5..2.0).contains(&(with / without / times)), "{row:?}");
+        assert!(without > 0.0 && (0.93..1.08).contains(&(with / without / times)), "{row:?}");
         let (least, most) = (number(5), number_after(row[5], " to "));
         assert!(least <= times && times <= most, "{row:?}");
         // A guest that has nothing to compensate would be as fast in both.
@@ -49,6 +49,30 @@ fn what_compensation_adds_is_measured_on_our_own_body() {
         assert!(lost > 0.0 && compensated > 0.0, "{row:?}");
         assert!(times.is_finite() && times > 0.9, "compensation costs, but for what a clock is off: {row:?}");
     }
+}
+
+/// Time of a step of a bar of 60 linear modes under a hand, us: the fastest of some rounds.
+fn step_of_60_modes_us() -> f64 {
+    use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
+    use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
+    let mesh = pliant_mesh::shapes::bar([8, 3, 3], [1.0, 0.2, 0.2]).unwrap();
+    let anchors = vec![Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 }];
+    let config = BakeConfig { anchors, ..BakeConfig::linear() };
+    let model = bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model;
+    let mut body = Body::new(std::sync::Arc::new(model), BodyConfig::default()).unwrap();
+    let positions = body.model().surface().positions();
+    let end = (0..positions.len()).max_by(|a, b| positions[*a][0].total_cmp(&positions[*b][0])).unwrap();
+    let patch = Patch::around(body.model().surface(), end as u32, 0.1).unwrap();
+    body.grab(&patch, GrabConfig::default()).unwrap();
+    let mut fastest = f64::INFINITY;
+    for _ in 0..20 {
+        let began = std::time::Instant::now();
+        for _ in 0..200 {
+            body.step().unwrap();
+        }
+        fastest = fastest.min(began.elapsed().as_secs_f64() * 1e6 / 200.0);
+    }
+    fastest
 }
 
 #[test]
@@ -75,9 +99,18 @@ fn the_default_is_told_of_our_own_body() {
             assert!(row.rms <= row.most + 0.005 && row.most < most * row.by, "{row:?}");
             // A part of the error is no more than all of it, which has no decimal.
             assert!(row.along <= row.whole + 0.55, "{row:?}");
-            assert!(0.0 < row.step_us && row.step_us < 1_000.0, "{row:?}");
         }
     }
+    // What a step takes: of 60 linear modes on both meshes alike, as much as one of 60 modes that is
+    // timed here, and much more with the energy of reduced elasticity.
+    let fastest = |rows: &[Pulled]| rows.iter().map(|row| row.step_us).fold(f64::INFINITY, f64::min);
+    let [four_us, ten_us, reduced_us] = [&of_four, &of_ten, &of_reduced].map(|rows| fastest(rows));
+    let here_us = step_of_60_modes_us();
+    println!("{four_us}, {ten_us} and {reduced_us} us, {here_us} us here");
+    for us in [four_us, ten_us] {
+        assert!((0.3..3.0).contains(&(us / here_us)), "{us} us, {here_us} us here");
+    }
+    assert!((25.0..600.0).contains(&(reduced_us / four_us)), "{reduced_us} us, linear {four_us} us");
     // Linear forces are right for small pulls only, and the warp is what the shape has it from.
     for (rows, gain) in [(&of_four, 0.3), (&of_ten, 1.0)] {
         assert!(rows[0].along < 3.0 && rows.iter().all(|row| row.along < 30.0), "{rows:?}");
@@ -157,9 +190,10 @@ fn the_papers_figures_have_their_curves_and_say_how_far_each_is_off() {
                 }
                 assert!(compared > shown.len() / 2, "{figure}, {row:?}: {compared} ticks");
                 let drawn = off.iter().fold(0.0f64, |most, x| most.max(x.abs()));
-                // The default's host has another integrator, and what is far off is cut.
-                if !row[0].starts_with("default") && told < 50.0 {
-                    assert!((drawn - told).abs() < 0.02 * told + 0.02, "{figure}, {row:?}: {drawn}");
+                // Both are shares of one largest value. The table has three decimals and the file four
+                // digits, and what is far off is cut.
+                if told < 50.0 {
+                    assert!((drawn - told).abs() < 6e-4 + 5e-4 * told, "{figure}, {row:?}: {drawn}");
                 }
             }
             if row[0].contains("compensated in") || row[0].starts_with("predicted and") {

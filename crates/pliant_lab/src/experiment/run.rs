@@ -277,15 +277,14 @@ impl Run {
             force_rms_of_force_percent: percent(self.force_sum.sqrt(), self.force_motion.sqrt()),
             force_ringing: ratio(self.visual_second, self.force_scale),
             true_ringing: ratio(self.true_second, self.force_scale),
-            hand_to_force_ms: 1e3
-                * if self.predict_hand {
-                    // The guest's own copy of the body answers at its next tick.
-                    self.h
-                } else {
-                    // A target leaves with the guest's tick and waits for the host's next step,
-                    // half a step on average. Then its reaction travels back and is shown.
-                    session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay
-                },
+            hand_to_force_ms: if self.predict_hand {
+                // The guest's own copy of the body answers, and nothing here measures when.
+                f64::NAN
+            } else {
+                // A target leaves with the guest's tick and waits for the host's next step, half a
+                // step on average. Then its reaction travels back and is shown.
+                1e3 * (session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay)
+            },
             visual_delay_ms: 1e3 * delay,
             recover_ms: longest.as_secs_f64() * 1e3,
             hash: self.hash,

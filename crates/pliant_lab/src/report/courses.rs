@@ -174,10 +174,11 @@ fn figure(course: &Course, force: bool) -> Figure {
     } else {
         words.push_str("The figure shows the displacement at the first hand along its largest reach, and below it, for each line with its own scale, what was shown less what was true. Lines that hide each other above agree. *True* is of the paper's host; that of the default has the exact step and moves a little otherwise, and each line is compared with its own host. What is not as in the paper: the body (a bar of 60 modes), the paths of the hands (two that circle slowly), and the frames (plain numbers, but in our datagrams). *Anywhere* is at some 48 vertices of the surface.\n\n| line | largest error of the shape at the hand % | anywhere % | at the end % | shape, rms / rms of the motion % | largest error of the force at the hand % | force, rms / rms of the force % |\n| --- | --- | --- | --- | --- | --- | --- |\n");
         for (name, f) in &course.lines {
+            // By the largest true value of all lines, as in the plots.
             let most = |of: &dyn Fn(&TrackPoint) -> [f64; 2]| {
-                let all = f.track.iter().map(of);
-                let scale = all.clone().fold(1e-12, |m: f64, p| m.max(p[0].abs()));
-                100.0 * all.fold(0.0, |m: f64, p| m.max((p[1] - p[0]).abs())) / scale
+                let all = course.lines.iter().flat_map(|(_, f)| &f.track).map(of);
+                let scale = all.fold(1e-12, |m: f64, p| m.max(p[0].abs()));
+                100.0 * f.track.iter().map(of).fold(0.0, |m: f64, p| m.max((p[1] - p[0]).abs())) / scale
             };
             // Writing to a string cannot fail.
             let _ = writeln!(

@@ -89,7 +89,9 @@ pub(super) fn precision() -> Result<Figure, LabError> {
     })
 }
 
-/// A row of the paper's table 2: name, tetrahedra, modes, bake time (s) and steps a second.
+/// A row of the paper's table 2: name, tetrahedra, modes, bake time (s) and steps a second. The paper
+/// has these with its compensation and without. Which of the two this column is was not noted when
+/// it was copied, and the other one was not copied.
 const PAPER: [(&str, usize, usize, f64, f64); 4] = [
     ("bar", 1_080, 20, 0.11, 1124.2),
     ("bunny", 50_000, 60, 14.7, 264.2),
@@ -100,7 +102,10 @@ const PAPER: [(&str, usize, usize, f64, f64); 4] = [
 /// Goal of each row as a multiple of the paper's steps a second.
 const BAR: f64 = 20.0;
 
-const BOUND: &str = "\nAll bodies have linear elasticity (`BakeConfig::linear`); a step of reduced elasticity, which a bake has by default, takes longer (figure h). A frame is a step under a moving hand, followed by the reconstruction of the whole surface. The steps a second are those of the median frame. The memory bandwidth bounds the frame: a step takes a few microseconds, and the rest is the surface. The surface is one pass over the basis, which has 24 bytes for each vertex and mode (displacement and rotation, single precision) and is read once a frame. The column \"of the memory's limit\" compares the speed of this pass with the fastest of some thousand passes in the same run, which include plain sums over a buffer of the same size as well as surfaces. Near 100 %, only fewer bytes can make the frame faster. Half precision needs 12 bytes (`ModalBody::half_basis`) and is off by default, so a row that reaches the goal only in half precision does not reach it by default. Another way is to leave out modes that move no vertex by a tenth of a pixel (`SurfaceDetail`, which is on by default for the picture and off here). The limit itself depends on what else uses the memory of the machine. The paper differs in its processor (one core of a 2.93 GHz Core 2 Duo of 2008) and in its meshes, which have the same sizes. Our surface also includes the warp.\n";
+const BOUND: &str = "\nAll bodies have linear elasticity (`BakeConfig::linear`); a step of reduced elasticity, which a bake has by default, takes longer (figure h). A frame is a step under a moving hand, followed by the reconstruction of the whole surface. The steps a second are those of the median frame. The memory bandwidth bounds the frame: a step takes a few microseconds, and the rest is the surface. The surface is one pass over the basis, which has 24 bytes for each vertex and mode (displacement and rotation, single precision) and is read once a frame. The column \"of the memory's limit\" compares the speed of this pass with the fastest of some thousand passes in the same run, which include plain sums over a buffer of the same size as well as surfaces. Near 100 %, only fewer bytes can make the frame faster. Half precision needs 12 bytes (`ModalBody::half_basis`) and is off by default, so a row that reaches the goal only in half precision does not reach it by default. Another way is to leave out modes that move no vertex by a tenth of a pixel (`SurfaceDetail`, which is on by default for the picture and off here). The limit itself depends on what else uses the memory of the machine. Of the steps a second the paper has two columns, with its compensation and without. One of them is quoted here and the other is not, and which of them it is was not noted, so that the ratio may be too high or too low by what compensation took there (the next part has what it takes here). The paper differs in its processor (one core of a 2.93 GHz Core 2 Duo of 2008) and in its meshes, which have the same sizes. Our surface also includes the warp.\n";
+
+/// Where the surfaces are from that table 2 and the last part measure.
+const SURFACES: &str = "\nWhere the surfaces are from: the bunny and the armadillo are reconstructions of the [Stanford 3D Scanning Repository](https://graphics.stanford.edu/data/3Dscanrep/), which has them as PLY files. The files behind the figures of this repository are decimated and rescaled copies of them as closed OBJ files: bunny.obj with 3,301 vertices, y from -0.77 to 0.77 (SHA-256 d97f4aa37c2f3bfb14eceb3d06ac1f466062dc45f08e019bfbae9704c28654b6), and armadillo.obj with 14,587 vertices, y from -0.57 to 0.43 (SHA-256 17200138dad1ad0f86ef9a98dd38f9932098b2c9e94d8694bd3f6143601e8c54). By which program they were decimated is not known, so that a copy of your own has other vertices and somewhat other figures. Any closed surface of that name will do in the folder of `--models`. The repository's terms allow copies with an acknowledgement and no commercial use, so that a project under MIT or Apache-2.0 does not ship them. For a surface that is not there, and for the dragon, which may not be deformed, the project's own body stands in.\n";
 
 /// Says whether a row reaches the goal.
 fn verdict(single: f64, half: f64) -> String {
@@ -161,7 +166,7 @@ pub(super) fn table_2(
     (seconds, fewer): (f64, usize),
     progress: &mut dyn Progress,
 ) -> Result<String, LabError> {
-    let mut out = "| body | tetrahedra | modes | surface | bake s (paper) | step us, 50 % / 99 % | step and surface us, 50 % / 99 % | steps/s with surface and hand (paper) | ratio | the surface, of the memory's limit | half-precision basis: step and surface us, 50 % / 99 % | ratio | of the memory's limit | the bar |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n".to_owned();
+    let mut out = "| body | tetrahedra | modes | surface | bake s (in brackets the paper's) | step us, 50 % / 99 % | step and surface us, 50 % / 99 % | steps/s with surface and hand (in brackets the one column of the paper's that is quoted, see below) | ratio | the surface, of the memory's limit | half-precision basis: step and surface us, 50 % / 99 % | ratio | of the memory's limit | the bar |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n".to_owned();
     for (name, tets, modes, paper_bake, paper_rate) in PAPER {
         let (source, label) = surface_of(name, models, own);
         let (tets, model, bake) = body_of(source.as_deref(), tets / fewer, modes, progress)?;
@@ -187,6 +192,7 @@ pub(super) fn table_2(
         );
     }
     out.push_str(BOUND);
+    out.push_str(SURFACES);
     Ok(out)
 }
 
