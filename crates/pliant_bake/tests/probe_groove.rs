@@ -21,15 +21,29 @@ fn sine() -> f64 {
 }
 
 /// A block that stands on its fixed bottom. Two faces at 45 degrees meet in its top, at `x = 0`. A
-/// ball in this valley touches each of them at a vertex.
+/// ball in this valley touches each of them at a vertex. Its halves mirror each other.
 fn grooved() -> TetMesh {
     let edge = RADIUS * sine();
-    let mut mesh = shapes::bar([10, 4, 6], [10.0 * edge, 1.0, 6.0 * edge]).unwrap();
+    let mut mesh = shapes::bar([5, 4, 6], [5.0 * edge, 1.0, 6.0 * edge]).unwrap();
     for node in &mut mesh.nodes {
-        node[0] -= 5.0 * edge;
-        node[1] *= VALLEY + node[0].abs();
+        node[1] *= VALLEY + node[0];
         node[2] -= 3.0 * edge;
     }
+    let half = mesh.clone();
+    let mirrored: Vec<u32> = half
+        .nodes
+        .iter()
+        .zip(0..)
+        .map(|([x, y, z], number)| {
+            if *x == 0.0 {
+                return number;
+            }
+            mesh.nodes.push([-x, *y, *z]);
+            mesh.nodes.len() as u32 - 1
+        })
+        .collect();
+    mesh.tets.extend(half.tets.iter().map(|tet| tet.map(|node| mirrored[node as usize])));
+    mesh.orient();
     mesh.check().unwrap();
     mesh
 }
@@ -146,6 +160,83 @@ fn a_ball_rests_on_both_faces_of_a_groove() {
             assert!(each.iter().all(|each| (each / statics - 1.0).abs() < 0.02), "{each:?} of {statics}");
             assert!(f.x.hypot(f.z) < 0.02 * f.y, "{f}");
             assert!(felt.jump < 1e-3 * f.y && felt.most - felt.least < 1e-2 * f.y, "it trembles");
+        }
+    }
+}
+
+/// A capsule along a groove, and one across it, whose ends lie on one face each.
+#[test]
+fn a_capsule_rests_in_a_groove() {
+    let mesh = grooved();
+    for young in [2e4, 1e5, 1e6] {
+        let soft = model(&mesh, young, Some("y<0.001"));
+        for (rate, friction) in [(60.0, 0.0), (60.0, 0.5), (1000.0, 0.0), (1000.0, 0.5)] {
+            let mut bodies = [body(&soft, rate)];
+            let mut probes = [in_groove(friction, touching() + Vector3::new(0.0, 0.01, 0.0))];
+            probes[0].set_corners(&[[0.0, 0.0, -0.02], [0.0, 0.0, 0.02]]).unwrap();
+            feel(&mut bodies, &mut probes, 2, rate);
+            let down = rate as usize / 2;
+            for k in 1..=down {
+                let way = -0.01 + (0.01 + DEPTH) * k as f64 / down as f64;
+                probes[0].set_target((touching() - Vector3::new(0.0, way, 0.0)).into()).unwrap();
+                feel(&mut bodies, &mut probes, 1, rate);
+            }
+            feel(&mut bodies, &mut probes, 2 * down, rate);
+            let felt = feel(&mut bodies, &mut probes, down, rate);
+            let f = force(&probes[0]);
+            let each = felt.sides.map(|side| side.norm());
+            println!(
+                "E {young:.0e} at {rate} Hz, friction {friction}: {:.4} N, faces {:.4} and {:.4} N, {:.4} to \
+                 {:.4} N, jump {:.1e} N, {} contacts",
+                f.y,
+                each[0],
+                each[1],
+                felt.least,
+                felt.most,
+                felt.jump,
+                probes[0].contacts().len()
+            );
+            // The ball has .36 to 1.4 N there.
+            assert!(f.y > 0.5 * STIFFNESS * DEPTH * if young < 1e5 { 0.5 } else { 1.0 }, "{f}");
+            assert!(f.x.hypot(f.z) < 0.02 * f.y, "{f}");
+            assert!((each[0] / each[1] - 1.0).abs() < 0.05, "{each:?}");
+            assert!(felt.jump < 1e-3 * f.y && felt.most - felt.least < 1e-2 * f.y, "it trembles");
+        }
+    }
+}
+
+/// A hand that leads a ball and a capsule over a groove, into both faces of it and out again, on a
+/// closed way, has given energy.
+#[test]
+fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
+    let soft = model(&grooved(), 5e4, Some("y<0.001"));
+    for (rate, length) in [(60.0, 0.0), (1000.0, 0.0), (60.0, 0.02), (1000.0, 0.02)] {
+        for friction in [0.0, 0.5] {
+            let mut bodies = [body(&soft, rate)];
+            let mut probes = [in_groove(friction, touching() + Vector3::new(0.0, 0.01, 0.0))];
+            if length > 0.0 {
+                probes[0].set_corners(&[[0.0, 0.0, -length], [0.0, 0.0, length]]).unwrap();
+            }
+            let mut islands = Islands::default();
+            let (mut given, mut most, mut last) = (0.0, 0.0f64, None::<Vector3<f64>>);
+            for k in 0..=(8.0 * rate) as usize {
+                let t = std::f64::consts::TAU * k as f64 / (2.0 * rate);
+                let way = Vector3::new(0.012 * t.sin(), 0.003 + 0.007 * t.cos(), 0.01 * (2.0 * t).sin());
+                let to = touching() + way;
+                probes[0].set_target(to.into()).unwrap();
+                step(&mut islands, &mut bodies, &mut probes, rate);
+                let f = force(&probes[0]);
+                most = most.max(f.norm());
+                if let Some(from) = last {
+                    given -= f.dot(&(to - from));
+                }
+                last = Some(to);
+                assert!(bodies[0].energy() < 0.1, "{} J", bodies[0].energy());
+            }
+            println!(
+                "at {rate} Hz, {length} m, friction {friction}: {given:.5} J in four rounds, {most:.3} N at most"
+            );
+            assert!(given > 0.0 && most > 0.5, "{given} {most}");
         }
     }
 }

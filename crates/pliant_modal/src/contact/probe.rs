@@ -115,6 +115,8 @@ pub(crate) struct ProbeMemory {
     pub(crate) spot: Spot,
     /// The place of the body.
     pub(crate) place: Option<Place>,
+    /// A point and the normal of the surface, m, world axes.
+    pub(crate) plane: [Vector3<f64>; 2],
 }
 
 /// A tool that a hand holds by a spring, and that touches bodies and obstacles without gripping.

@@ -6,7 +6,7 @@ use super::super::super::{
     group::{Group, Member},
     touch::look,
 };
-use super::{RECOVERY_SPEED, compliance, floor, is_far, normal_of, plane_of, reach, slide};
+use super::{RECOVERY_SPEED, compliance, floor, is_far, normal_of, on_side, plane_of, reach, slide};
 use crate::{
     Probe, ProbeContact, StepError,
     contact::{ContactPoint, ProbeMemory, Touched, Touching},
@@ -46,14 +46,14 @@ pub(in super::super) fn linearize_at_probe<P: Member>(
             let view = group.view(point.member);
             let Some([_, shape]) = group.shapes(point.member) else { return Ok(()) };
             let mut last = at.last.unwrap_or(*place);
-            let within = reach(radius, shape.size);
+            let within = [reach(radius, shape.size), radius];
             if !far {
                 at.nearest = slide(probe, &at.spot, true, |x| {
-                    Ok(normal_of(shape.nearest(x, within, Some(&last)), &mut last))
+                    Ok(normal_of(on_side(&shape, x, &at.plane, within, Some(&last)), &mut last))
                 })?;
             }
             let x = probe.ended(&at.nearest.at);
-            let near = if far { None } else { shape.nearest(&x, within, Some(&last)) };
+            let near = if far { None } else { on_side(&shape, &x, &at.plane, within, Some(&last)) };
             let near = near.unwrap_or_else(|| shape.at(&last, &x));
             (at.last, at.plane) = (Some(near.place), plane_of(&near, &x));
             let (end, tangent): (_, Tangent) = shape.material(place, carriers);
@@ -135,7 +135,8 @@ pub(in super::super::super) fn keep_at_probe<P: Member>(
     let (other, on_probe, velocity, compliance, memory) = match &at.first {
         None => {
             let anchor = if sliding { x + dent } else { point.anchor + (x - at.carried) };
-            let memory = ProbeMemory { other: point.other, force, anchor, spot, place: None };
+            let memory =
+                ProbeMemory { other: point.other, force, anchor, spot, place: None, plane: at.plane };
             (point.other, force, point.carried / h, Matrix3::zeros(), memory)
         }
         Some((place, carriers)) => {
@@ -147,7 +148,7 @@ pub(in super::super::super) fn keep_at_probe<P: Member>(
             let of = end.field.carriers(&next);
             anchor += end.material(&next, &of).0 - end.material(place, carriers).0;
             let other = Touched::Body(view.contacts.key);
-            let memory = ProbeMemory { other, force, anchor, spot, place: Some(next) };
+            let memory = ProbeMemory { other, force, anchor, spot, place: Some(next), plane: at.plane };
             let way = end.material(&next, &of).0 - start.material(&next, &of).0;
             (other, -force, way / h, point.compliance, memory)
         }
