@@ -293,6 +293,10 @@ impl Probe {
         self.seeds.iter().enumerate().map(|(number, at)| Spot { at: *at, fixed: Some(number) })
     }
 
+    pub(crate) fn is_ball(&self) -> bool {
+        self.corners == 1 && !self.turns()
+    }
+
     /// Whether a place that stays lies between corners.
     pub(crate) fn is_between(&self, spot: &Spot) -> bool {
         spot.fixed.is_some_and(|number| number >= self.corners)

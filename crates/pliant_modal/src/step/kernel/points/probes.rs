@@ -54,27 +54,26 @@ fn plane_of(near: &Near, center: &Vector3<f64>) -> [Vector3<f64>; 2] {
 /// a groove, as a share of the radius.
 const ABOVE: f64 = 0.05;
 
-/// Whether two planes that a sphere touches are the sides of a groove: each place lies above the
+/// Whether two planes that a ball touches are the sides of a groove: each place lies above the
 /// plane of the other. Two faces that meet in an edge are none, and a contact moves from one to the
-/// other.
-fn is_groove([a, n]: &[Vector3<f64>; 2], [b, m]: &[Vector3<f64>; 2], radius: f64) -> bool {
-    let way = b - a;
-    n.dot(m) < ALONG && n.dot(&way) > ABOVE * radius && -m.dot(&way) > ABOVE * radius
+/// other. Other shapes touch one side, because their places slide over them.
+fn is_groove(probe: &Probe, [a, n]: &[Vector3<f64>; 2], [b, m]: &[Vector3<f64>; 2]) -> bool {
+    let (way, least) = (b - a, ABOVE * probe.config().radius);
+    probe.is_ball() && n.dot(m) < ALONG && n.dot(&way) > least && -m.dot(&way) > least
 }
 
-/// The place of a body that is nearest to a point (m, world axes). Of the two sides of a groove it
-/// is that of the plane of the contact, as long as it is there. Without that a contact would
-/// alternate between the sides, and each time lose its force. `within` has the farthest distance
-/// and the radius, m.
+/// The place of a body that is nearest to a point (m, world axes), no farther than `within` (m). Of
+/// the two sides of a groove it is that of the plane of the contact, as long as it is there.
+/// Without that a contact would alternate between the sides, and each time lose its force.
 fn on_side(
+    (probe, plane): (&Probe, &[Vector3<f64>; 2]),
     shape: &Shape<'_>,
     point: &Vector3<f64>,
-    plane: &[Vector3<f64>; 2],
-    [within, radius]: [f64; 2],
+    within: f64,
     hint: Option<&Place>,
 ) -> Option<Near> {
     let near = shape.nearest(point, within, hint)?;
-    if is_groove(plane, &plane_of(&near, point), radius) {
+    if is_groove(probe, plane, &plane_of(&near, point)) {
         return shape.nearest_of(point, &Side::Along(plane[1]), within, hint);
     }
     Some(near)
@@ -128,16 +127,19 @@ pub(in super::super) fn begin_probes<P: Member>(
                     let (Some([shape, _]), Some(place)) = (group.shapes(member), memory.place) else {
                         continue;
                     };
-                    let (within, plane) = ([reach(radius, shape.size), radius], &memory.plane);
+                    let within = reach(radius, shape.size);
                     let mut hint = place;
                     let spot = slide(probe, &memory.spot, false, |x| {
-                        Ok(normal_of(on_side(&shape, x, plane, within, Some(&hint)), &mut hint))
+                        Ok(normal_of(shape.nearest(x, within, Some(&hint)), &mut hint))
                     })?;
                     let center = probe.begun(&spot.at);
-                    let near = on_side(&shape, &center, plane, within, Some(&place));
+                    let near = on_side((probe, &memory.plane), &shape, &center, within, Some(&place));
                     let near = near.unwrap_or_else(|| shape.at(&place, &center));
-                    let at = is_at_side(member, index, plane_of(&near, &center), radius);
-                    if is_taken(work, at, &spot, radius) {
+                    let plane = plane_of(&near, &center);
+                    let same = |point: &ContactPoint, at: &AtProbe| {
+                        is_at_body(point, at, member, index) && !is_groove(probe, &plane, &at.plane)
+                    };
+                    if is_taken(work, same, &spot, radius) {
                         continue;
                     }
                     let mut point = at_body(&view, &shape, member, &place, (probe, own, spot), &near);
@@ -145,7 +147,7 @@ pub(in super::super) fn begin_probes<P: Member>(
                     let (normal, farthest) = (-near.normal, SNAPPED * shape.size);
                     let anchor = memory.anchor - (center - probe.begun(&memory.spot.at));
                     resume(&mut point, memory.force, &normal, anchor, -center, farthest);
-                    if !(probe.is_between(&spot) && shares_site(work, &point, radius)) {
+                    if !(probe.is_between(&spot) && shares_site(work, &point)) {
                         work.points.push(point);
                     }
                 }
@@ -172,16 +174,6 @@ fn is_at_body(point: &ContactPoint, at: &AtProbe, member: usize, probe: usize) -
     point.member == member && at.first.is_some() && at.probe == probe
 }
 
-/// As [`is_at_body`], and not on another side of a groove than a plane.
-fn is_at_side(
-    member: usize,
-    probe: usize,
-    plane: [Vector3<f64>; 2],
-    radius: f64,
-) -> impl Fn(&ContactPoint, &AtProbe) -> bool {
-    move |point, at| is_at_body(point, at, member, probe) && !is_groove(&plane, &at.plane, radius)
-}
-
 /// The place of a probe that is nearest to a surface, no farther from `spot` than a radius: what is
 /// nearer farther away is another contact. Some places stay.
 fn slide(
@@ -201,15 +193,13 @@ fn site_of(point: &ContactPoint) -> Option<usize> {
     point.probe.and_then(|at| at.first)?.1.largest()
 }
 
-/// Whether a place between corners would share its site with another place of the probe on the same
-/// side of a groove, whose dent it then has already.
-fn shares_site(work: &Touching, new: &ContactPoint, radius: f64) -> bool {
+/// Whether a place between corners would share its site with another place of the probe, whose
+/// dent it then has already.
+fn shares_site(work: &Touching, new: &ContactPoint) -> bool {
     let (Some(at), Some(site)) = (new.probe, site_of(new)) else { return false };
     let same = |point: &ContactPoint| {
         point.member == new.member
-            && point
-                .probe
-                .is_some_and(|other| other.probe == at.probe && !is_groove(&other.plane, &at.plane, radius))
+            && point.probe.is_some_and(|other| other.probe == at.probe)
             && site_of(point) == Some(site)
     };
     work.points.iter().any(same)
@@ -293,7 +283,6 @@ fn unite<P: Member>(group: &Group<'_, P>, work: &mut Touching) {
                     && other
                         .probe
                         .is_some_and(|own| own.probe == at.probe && own.nearest.is_same(&at.nearest, radius))
-                    && other.probe.is_some_and(|own| !is_groove(&own.plane, &at.plane, radius))
             };
             (0..work.points.len()).find(|&other| other != number && same(&work.points[other]))
         });
@@ -408,7 +397,7 @@ fn detect_at_obstacle<P: Member>(
 }
 
 /// As [`detect_at_obstacle`], at a body, with the places between corners that penetrate, one for
-/// each site. Where a place lies in a groove, it touches both sides.
+/// each site, and with both sides of a groove in which a ball lies.
 fn detect_at_body<P: Member>(
     group: &Group<'_, P>,
     work: &mut Touching,
@@ -444,80 +433,45 @@ fn detect_at_body<P: Member>(
         let slid = (ended - point.start) - (probe.carried(&spot.at, &near.normal) - from);
         point.anchor = point.start - from + share(point.gap, near.distance - radius) * slid;
         point.turn(&-near.normal);
-        if probe.is_between(&spot) && shares_site(work, &point, radius) {
+        if probe.is_between(&spot) && shares_site(work, &point) {
             return;
         }
         penetrates |= near.distance < radius;
         work.points.push(point);
     };
-    let at_side = |plane: [Vector3<f64>; 2]| is_at_side(member, index, plane, radius);
-    // The nearest places between corners, on each side of a groove.
-    let mut nearest: [Option<(Near, bool, Spot)>; 2] = [None; 2];
+    let mut nearest: Option<(Near, bool, Spot)> = None;
     let mut between = std::mem::take(&mut work.between);
     between.clear();
     for spot in probe.spots() {
-        let is_corner = !probe.is_between(&spot);
-        let to = probe.ended(&spot.at);
-        let mut take = |work: &mut Touching, near: Near, passed: bool| {
-            if is_corner {
-                if near.distance < 2.0 * radius {
-                    add(work, spot, &near, passed);
-                }
-                return;
-            }
-            if near.distance < radius {
-                between.push((near, passed, spot));
-            }
-            let plane = plane_of(&near, &to);
-            let beside = nearest[0].is_some_and(|(first, _, spot): (Near, bool, Spot)| {
-                is_groove(&plane_of(&first, &probe.ended(&spot.at)), &plane, radius)
-            });
-            let least = &mut nearest[usize::from(beside)];
-            if least.is_none_or(|(other, ..)| near.distance < other.distance) {
-                *least = Some((near, passed, spot));
-            }
-        };
-        let mut known = work.points.iter().filter_map(|point| {
-            let at = point.probe.filter(|at| is_at_body(point, at, member, index))?;
-            let same = at.nearest.is_same(&spot, radius) || at.spot.is_same(&spot, radius);
-            same.then_some((at.plane, at.last, point.passed))
-        });
-        let (plane, hint, passed) = match (known.next(), known.next()) {
-            (Some(_), Some(_)) => continue,
-            (Some(first), None) => first,
-            (None, _) => {
-                let Some((near, passed)) = look_at(&spot) else { continue };
-                take(work, near, passed);
-                if near.distance >= 2.0 * radius {
-                    continue;
-                }
-                (plane_of(&near, &to), Some(near.place), passed)
-            }
-        };
-        // In a step no place goes so far that it meets another side that was not near at first.
-        if !is_first || passed {
+        if is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
             continue;
         }
-        let beside = end.nearest_of(&to, &Side::Beside(plane[1]), 2.0 * radius, hint.as_ref());
-        if let Some(near) = beside.filter(|near| is_groove(&plane, &plane_of(near, &to), radius)) {
-            take(work, near, false);
+        let Some((near, passed)) = look_at(&spot) else { continue };
+        if !probe.is_between(&spot) {
+            if near.distance < 2.0 * radius {
+                add(work, spot, &near, passed);
+            }
+            continue;
+        }
+        if near.distance < radius {
+            between.push((near, passed, spot));
+        }
+        if nearest.is_none_or(|(other, ..)| near.distance < other.distance) {
+            nearest = Some((near, passed, spot));
         }
     }
-    for (mut near, passed, Spot { at: mut place, .. }) in nearest.into_iter().flatten() {
-        let plane = plane_of(&near, &probe.ended(&place));
-        let within = [within, radius];
+    if let Some((mut near, passed, Spot { at: mut place, .. })) = nearest {
         if !passed {
             let mut hint = near.place;
             place = probe.slide(&place, f64::INFINITY, true, |x| {
-                Ok(normal_of(on_side(&end, x, &plane, within, Some(&hint)), &mut hint))
+                Ok(normal_of(end.nearest(x, within, Some(&hint)), &mut hint))
             })?;
-            near = on_side(&end, &probe.ended(&place), &plane, within, Some(&hint)).unwrap_or(near);
+            near = end.nearest(&probe.ended(&place), within, Some(&hint)).unwrap_or(near);
         }
         let spot = Spot { at: place, fixed: None };
-        let taken = is_taken(work, at_side(plane_of(&near, &probe.ended(&place))), &spot, radius);
-        let distance = |x: &Vector3<f64>| {
-            Ok(on_side(&end, x, &plane, within, Some(&near.place)).map(|near| near.distance))
-        };
+        let taken = is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius);
+        let distance =
+            |x: &Vector3<f64>| Ok(end.nearest(x, within, Some(&near.place)).map(|near| near.distance));
         let touches = near.distance < 2.0 * radius && !taken;
         let alone = |work: &Touching| {
             let of_both = |at: AtProbe, point| is_at_body(point, &at, member, index);
@@ -527,12 +481,41 @@ fn detect_at_body<P: Member>(
             add(work, spot, &near, passed);
         }
     }
+    // In a step a ball does not go so far that it meets another side that was not near at first.
+    if is_first
+        && let Some((spot, near)) =
+            beside(probe, &end, work, |point, at| is_at_body(point, at, member, index))
+    {
+        add(work, spot, &near, false);
+    }
     // A soft surface is pressed along the whole length between corners.
     for (near, passed, spot) in between.drain(..) {
-        if !is_taken(work, at_side(plane_of(&near, &probe.ended(&spot.at))), &spot, radius) {
+        if !is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
             add(work, spot, &near, passed);
         }
     }
     work.between = between;
     Ok(penetrates)
+}
+
+/// The other side of the groove in which a ball lies that touches one, and the place of the ball.
+fn beside(
+    probe: &Probe,
+    shape: &Shape<'_>,
+    work: &Touching,
+    of: impl Fn(&ContactPoint, &AtProbe) -> bool,
+) -> Option<(Spot, Near)> {
+    if !probe.is_ball() {
+        return None;
+    }
+    let sides = work.points.iter().filter_map(|point| Some((point, point.probe?)));
+    let mut sides = sides.filter(|(point, at)| of(point, at));
+    let (Some((point, at)), None) = (sides.next(), sides.next()) else { return None };
+    if point.passed {
+        return None;
+    }
+    let center = probe.ended(&at.spot.at);
+    let reach = 2.0 * probe.config().radius;
+    let near = shape.nearest_of(&center, &Side::Beside(at.plane[1]), reach, at.last.as_ref())?;
+    is_groove(probe, &at.plane, &plane_of(&near, &center)).then_some((at.spot, near))
 }

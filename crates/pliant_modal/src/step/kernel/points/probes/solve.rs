@@ -46,14 +46,14 @@ pub(in super::super) fn linearize_at_probe<P: Member>(
             let view = group.view(point.member);
             let Some([_, shape]) = group.shapes(point.member) else { return Ok(()) };
             let mut last = at.last.unwrap_or(*place);
-            let within = [reach(radius, shape.size), radius];
+            let within = reach(radius, shape.size);
             if !far {
                 at.nearest = slide(probe, &at.spot, true, |x| {
-                    Ok(normal_of(on_side(&shape, x, &at.plane, within, Some(&last)), &mut last))
+                    Ok(normal_of(shape.nearest(x, within, Some(&last)), &mut last))
                 })?;
             }
             let x = probe.ended(&at.nearest.at);
-            let near = if far { None } else { on_side(&shape, &x, &at.plane, within, Some(&last)) };
+            let near = if far { None } else { on_side((probe, &at.plane), &shape, &x, within, Some(&last)) };
             let near = near.unwrap_or_else(|| shape.at(&last, &x));
             (at.last, at.plane) = (Some(near.place), plane_of(&near, &x));
             let (end, tangent): (_, Tangent) = shape.material(place, carriers);
