@@ -291,8 +291,9 @@ impl Touch {
     }
 }
 
-/// The old slot of each plane: that of the same body or obstacle at which the tool's surface touches
-/// nearest to where it touches the plane. In a groove one place of the tool touches both sides.
+/// The old slot of each plane: that of the same body or obstacle at which the tool's surface
+/// touches nearest to where it touches the plane. In a groove one place of the tool touches both
+/// sides.
 fn matches(old: &[TouchSlot], planes: &[TouchPlane], radius: f64) -> [Option<usize>; MAX_PLANES] {
     let mut of = [None; MAX_PLANES];
     loop {
