@@ -164,18 +164,15 @@ fn a_ball_rests_on_both_faces_of_a_groove() {
     }
 }
 
-/// A hand that leads a ball or a capsule over a groove, into both faces of it and out again, on a
-/// closed way, has given energy.
+/// A hand that leads a ball over a groove, into both faces of it and out again, on a closed way,
+/// has given energy.
 #[test]
 fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
     let soft = model(&grooved(), 5e4, Some("y<0.001"));
-    for (rate, length) in [(60.0, 0.0), (1000.0, 0.0), (60.0, 0.02), (1000.0, 0.02)] {
+    for rate in [60.0, 1000.0] {
         for friction in [0.0, 0.5] {
             let mut bodies = [body(&soft, rate)];
             let mut probes = [in_groove(friction, touching() + Vector3::new(0.0, 0.01, 0.0))];
-            if length > 0.0 {
-                probes[0].set_corners(&[[0.0, 0.0, -length], [0.0, 0.0, length]]).unwrap();
-            }
             let mut islands = Islands::default();
             let (mut given, mut most, mut last) = (0.0, 0.0f64, None::<Vector3<f64>>);
             for k in 0..=(8.0 * rate) as usize {
@@ -192,9 +189,7 @@ fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
                 last = Some(to);
                 assert!(bodies[0].energy() < 0.1, "{} J", bodies[0].energy());
             }
-            println!(
-                "at {rate} Hz, {length} m, friction {friction}: {given:.5} J in four rounds, {most:.3} N at most"
-            );
+            println!("at {rate} Hz, friction {friction}: {given:.5} J in four rounds, {most:.3} N at most");
             assert!(given > 0.0 && most > 0.5, "{given} {most}");
         }
     }
