@@ -13,6 +13,7 @@ mod held;
 mod moments;
 mod pairs;
 mod probe;
+mod probe_groove;
 mod probe_shapes;
 mod punch;
 mod reduced;

@@ -146,7 +146,7 @@ impl Touch {
         (self.tick, self.since) = (model.tick, now);
         self.count = model.planes().len();
         let interval = interval(model).max(1e-3);
-        let of = matches(&old[..known], model.planes());
+        let of = matches(&old[..known], model.planes(), held.radius);
         for ((slot, plane), of) in self.slots.iter_mut().zip(model.planes()).zip(of) {
             let last = of.and_then(|of| old.get(of));
             let touched = last.filter(|slot| slot.force.x > 0.0);
@@ -291,15 +291,18 @@ impl Touch {
     }
 }
 
-/// The old slot of each plane: that of the same body or obstacle whose place of the tool is the
-/// nearest to that of the plane.
-fn matches(old: &[TouchSlot], planes: &[TouchPlane]) -> [Option<usize>; MAX_PLANES] {
+/// The old slot of each plane: that of the same body or obstacle at which the tool's surface
+/// touches nearest to where it touches the plane. In a groove one place of the tool touches both
+/// sides.
+fn matches(old: &[TouchSlot], planes: &[TouchPlane], radius: f64) -> [Option<usize>; MAX_PLANES] {
     let mut of = [None; MAX_PLANES];
     loop {
         let mut nearest: Option<(f64, usize, usize)> = None;
         for (new, plane) in planes.iter().enumerate().filter(|(new, _)| of[*new].is_none()) {
             for (known, slot) in old.iter().enumerate() {
-                let apart = (Vector3::from(slot.plane.spot) - Vector3::from(plane.spot)).norm();
+                let between = |[a, b]: [[f64; 3]; 2]| (Vector3::from(a) - Vector3::from(b)).norm();
+                let apart = between([slot.plane.spot, plane.spot])
+                    + radius * between([slot.plane.normal, plane.normal]);
                 let same = slot.plane.key == plane.key;
                 if same && !of.contains(&Some(known)) && nearest.is_none_or(|(least, ..)| apart < least) {
                     nearest = Some((apart, new, known));

@@ -326,14 +326,19 @@ impl Safety {
         let slew = self.slew_rate();
         if self.config.passivity.is_some() {
             let wanted = elastic + damping;
-            damping += self.passivity.dissipate(&w.velocity, w.dt);
+            let mut brake = self.passivity.dissipate(&w.velocity, w.dt);
             if w.one_sided {
-                // The controller may take away what pushes, but it may not pull.
+                // The controller may take away what pushes, but it may not pull. Across the push
+                // it brakes no harder than that pushes, so that a hand that leaves a surface
+                // feels no jerk. What is missing then stays on the account.
                 let push = wanted.try_normalize(f64::MIN_POSITIVE).unwrap_or_else(Vector3::zeros);
-                damping -= push * (elastic + damping).dot(&push).min(0.0);
-                if push == zero {
-                    damping = zero;
-                }
+                let along = brake.dot(&push);
+                let across = clamp_magnitude(&(brake - push * along), wanted.norm());
+                brake = across + push * along.max(-wanted.norm());
+            }
+            damping += brake;
+            if w.one_sided && wanted == zero {
+                damping = zero;
             }
             if let Some(limit) = self.config.max_damping {
                 damping = cap_damping(&damping, &w.velocity, limit);

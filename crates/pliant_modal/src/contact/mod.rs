@@ -56,4 +56,4 @@ pub(crate) use rigid::Pushed;
 pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};
 pub(crate) use solver::{Clearance, Look, Touching};
-pub(crate) use surface_field::{Bent, Carriers, Cloud, Place, closest_on_triangle};
+pub(crate) use surface_field::{ALONG, Bent, Carriers, Cloud, Place, Side, closest_on_triangle};

@@ -115,6 +115,8 @@ pub(crate) struct ProbeMemory {
     pub(crate) spot: Spot,
     /// The place of the body.
     pub(crate) place: Option<Place>,
+    /// A point and the normal of the surface, m, world axes.
+    pub(crate) plane: [Vector3<f64>; 2],
 }
 
 /// A tool that a hand holds by a spring, and that touches bodies and obstacles without gripping.
@@ -289,6 +291,10 @@ impl Probe {
     /// The places that stay: the corners, and then those between them.
     pub(crate) fn spots(&self) -> impl Iterator<Item = Spot> + '_ {
         self.seeds.iter().enumerate().map(|(number, at)| Spot { at: *at, fixed: Some(number) })
+    }
+
+    pub(crate) fn is_ball(&self) -> bool {
+        self.corners == 1 && !self.turns()
     }
 
     /// Whether a place that stays lies between corners.

@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::{
     ContactSites,
-    surface_field::{Carriers, Cloud, Place, SMOOTH, SurfaceField},
+    surface_field::{ALONG, Carriers, Cloud, Place, SMOOTH, Side, SurfaceField},
 };
 use crate::{
     HeldPatch,
@@ -271,6 +271,34 @@ impl Shape<'_> {
     ///
     /// Beside an edge or a corner, where the surface is not smooth, the normal leads to the point.
     pub(crate) fn nearest(&self, point: &Vector3<f64>, within: f64, kept: Option<&Place>) -> Option<Near> {
+        self.nearest_of(point, &Side::All, within, kept)
+    }
+
+    /// As [`Shape::nearest`], on one side of a groove, whose normal is in world axes.
+    pub(crate) fn nearest_of(
+        &self,
+        point: &Vector3<f64>,
+        side: &Side,
+        within: f64,
+        kept: Option<&Place>,
+    ) -> Option<Near> {
+        // The normal in the axes of the rest shape.
+        let rest = |gradient: &Matrix3<f64>| {
+            let turned = |normal: &Vector3<f64>| {
+                let normal = self.turn().tr_mul(normal);
+                gradient.tr_mul(&normal).try_normalize(1e-9).unwrap_or(normal)
+            };
+            match side {
+                Side::All => Side::All,
+                Side::Along(normal) => Side::Along(turned(normal)),
+                Side::Beside(normal) => Side::Beside(turned(normal)),
+            }
+        };
+        let fits = |near: &Near| match side {
+            Side::All => true,
+            Side::Along(normal) => near.normal.dot(normal) >= ALONG,
+            Side::Beside(normal) => near.normal.dot(normal) < ALONG && near.distance > 0.0,
+        };
         let local = self.frame.to_local(point);
         let still = 1e-6 * self.size;
         let pulled = |place: &Place| {
@@ -279,12 +307,13 @@ impl Shape<'_> {
             Some((rest + gradient.try_inverse()? * (local - rest - moved), moved, gradient))
         };
         let mut hint = kept.filter(|kept| self.field.has(kept)).copied();
-        let (mut x, mut reach) = (local, within + self.bound);
+        let (mut x, mut reach, mut wanted) = (local, within + self.bound, rest(&Matrix3::identity()));
         if let Some(kept) = &hint {
-            (x, reach) = (pulled(kept)?.0, 2.0 * within + 0.01 * self.size);
+            let (next, _, gradient) = pulled(kept)?;
+            (x, reach, wanted) = (next, 2.0 * within + 0.01 * self.size, rest(&gradient));
         }
         for round in 0..ROUNDS {
-            let place = self.field.closest(&x, None, reach, hint.as_ref())?;
+            let place = self.field.closest_of(&x, &wanted, reach, hint.as_ref())?;
             hint = Some(place);
             let (next, moved, gradient) = pulled(&place)?;
             if (next - x).norm() <= still || round + 1 == ROUNDS {
@@ -293,9 +322,9 @@ impl Shape<'_> {
                 let length = way.norm();
                 let sharp = near.normal.dot(&way) < SMOOTH * length && near.normal.dot(&way) > 0.0;
                 let near = if sharp { Near { normal: way / length, distance: length, ..near } } else { near };
-                return (near.distance.abs() <= within).then_some(near);
+                return (near.distance.abs() <= within && fits(&near)).then_some(near);
             }
-            x = next;
+            (x, wanted) = (next, rest(&gradient));
             reach = 2.0 * within + 0.01 * self.size;
         }
         None

@@ -13,6 +13,14 @@ pub(crate) const MAX_CARRIERS: usize = 3 * CARRIERS;
 /// Cosine of the angle between two triangles above which the surface is smooth between them.
 pub(super) const SMOOTH: f64 = 0.7;
 
+/// Cosine of the angle between two normals of a surface above which they belong to one side of a
+/// groove.
+pub(crate) const ALONG: f64 = 0.8;
+
+/// Cosine of the angle between a normal of a triangle and the way from its nearest place to a point
+/// above which the triangle lies below the point.
+const BELOW: f64 = 0.9;
+
 /// Largest cosine between the outward normals of a site and of a triangle that it may touch.
 const FACING: f64 = -0.2;
 
@@ -84,6 +92,16 @@ pub(crate) struct Bent {
     pub(crate) cloud: Cloud,
     pub(crate) slack: f64,
     pub(crate) spare: Cloud,
+}
+
+/// Which triangles of a surface a search looks at.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Side {
+    All,
+    /// Those of the side of a groove that has this normal.
+    Along(Vector3<f64>),
+    /// Those of another side of a groove, where they lie below the point.
+    Beside(Vector3<f64>),
 }
 
 /// A place of the rest surface.
@@ -200,6 +218,12 @@ impl Node {
         let [low, high] = &self.normals;
         facing.component_mul(low).inf(&facing.component_mul(high)).sum() > FACING
     }
+
+    /// Smallest and largest product of a normal of the node with a direction, or beyond them.
+    fn along(&self, direction: &Vector3<f64>) -> [f64; 2] {
+        let [low, high] = self.normals.each_ref().map(|normal| direction.component_mul(normal));
+        [low.inf(&high).sum(), low.sup(&high).sum()]
+    }
 }
 
 impl SurfaceField {
@@ -296,11 +320,56 @@ impl SurfaceField {
         within: f64,
         hint: Option<&Place>,
     ) -> Option<Place> {
+        match facing {
+            Some(facing) => self.search(
+                (point, within, hint),
+                |node| node.looks_away(facing),
+                |normal| facing.dot(normal) <= FACING,
+                |_, _| true,
+            ),
+            None => self.search((point, within, hint), |_| false, |_| true, |_, _| true),
+        }
+    }
+
+    /// As [`SurfaceField::closest`], of the triangles of one side.
+    pub(crate) fn closest_of(
+        &self,
+        point: &Vector3<f64>,
+        side: &Side,
+        within: f64,
+        hint: Option<&Place>,
+    ) -> Option<Place> {
+        match side {
+            Side::All => self.closest(point, None, within, hint),
+            Side::Along(of) => self.search(
+                (point, within, hint),
+                |node| node.along(of)[1] < ALONG,
+                |normal| of.dot(normal) >= ALONG,
+                |_, _| true,
+            ),
+            Side::Beside(of) => self.search(
+                (point, within, hint),
+                |node| node.along(of)[0] >= ALONG,
+                |normal| of.dot(normal) < ALONG,
+                |normal, way| normal.dot(way) > BELOW * way.norm(),
+            ),
+        }
+    }
+
+    /// The nearest place of the triangles whose nodes and normals count and which lie in a way to
+    /// the point that fits.
+    fn search(
+        &self,
+        (point, within, hint): (&Vector3<f64>, f64, Option<&Place>),
+        leaves_out: impl Fn(&Node) -> bool,
+        counts: impl Fn(&Vector3<f64>) -> bool,
+        fits: impl Fn(&Vector3<f64>, &Vector3<f64>) -> bool,
+    ) -> Option<Place> {
         let mut least = within * within;
         let mut found = None;
         let look = |number: u32, least: &mut f64, found: &mut Option<Place>| {
             let facet = &self.facets[number as usize];
-            if facing.is_some_and(|facing| facing.dot(&facet.normal) > FACING) {
+            if !counts(&facet.normal) {
                 return;
             }
             let corners = facet.corners.map(|v| &self.vertices[v as usize]);
@@ -311,8 +380,9 @@ impl SurfaceField {
             }
             let weights = closest_on_triangle(corners, point);
             let near: Vector3<f64> = corners.iter().zip(weights).map(|(x, w)| **x * w).sum();
-            let distance = (point - near).norm_squared();
-            if distance < *least {
+            let way = point - near;
+            let distance = way.norm_squared();
+            if distance < *least && fits(&facet.normal, &way) {
                 *least = distance;
                 *found = Some(Place { facet: number, weights });
             }
@@ -332,7 +402,7 @@ impl SurfaceField {
             let node = &self.nodes[index as usize];
             // Comparisons with no number are false, and such a point has no place.
             let near = away(node) < least;
-            if !near || facing.is_some_and(|facing| node.looks_away(facing)) {
+            if !near || leaves_out(node) {
                 continue;
             }
             if node.count == 0 {

@@ -399,7 +399,7 @@ impl<P: Member> Group<'_, P> {
             }
             let band = if round == 1 { BAND * self.size } else { 0.0 };
             let (mut new, candidates) = points::detect(self, work, band)?;
-            new |= points::detect_probes(self, work)?;
+            new |= points::detect_probes(self, work, round == 1)?;
             points::support(self, work, false);
             report.candidates += candidates;
             points::linearize(self, work, recovers, settled)?;

@@ -14,13 +14,17 @@ use super::{
     share,
 };
 use crate::{
-    ObstacleShape, Probe, ProbeContact, StepError,
+    ObstacleShape, Probe, StepError,
     contact::{
-        AtProbe, Carriers, ContactPoint, Grown, Near, Place, ProbeMemory, Shape, Spot, SurfacePoint, Touched,
+        ALONG, AtProbe, Carriers, ContactPoint, Grown, Near, Place, Shape, Side, Spot, SurfacePoint, Touched,
         Touching,
     },
-    step::Tangent,
 };
+
+mod solve;
+
+pub(super) use solve::linearize_at_probe;
+pub(in super::super) use solve::{fill_probe_rows, keep_at_probe, pull_on_probe};
 
 /// Way in a step, as a share of the radius, beyond which a place of a probe meets the plane of the
 /// place that it had, and not the place that is nearest after the way.
@@ -44,6 +48,35 @@ fn is_far(probe: &Probe, spot: &Spot) -> bool {
 /// The plane of a surface to which the nearest place of a body belongs.
 fn plane_of(near: &Near, center: &Vector3<f64>) -> [Vector3<f64>; 2] {
     [center - near.distance * near.normal, near.normal]
+}
+
+/// Height of each of two places above the plane of the other from which on they are on two sides of
+/// a groove, as a share of the radius.
+const ABOVE: f64 = 0.05;
+
+/// Whether two planes that a ball touches are the sides of a groove: each place lies above the
+/// plane of the other. Two faces that meet in an edge are none, and a contact moves from one to the
+/// other. Other shapes touch one side, because their places slide over them.
+fn is_groove(probe: &Probe, [a, n]: &[Vector3<f64>; 2], [b, m]: &[Vector3<f64>; 2]) -> bool {
+    let (way, least) = (b - a, ABOVE * probe.config().radius);
+    probe.is_ball() && n.dot(m) < ALONG && n.dot(&way) > least && -m.dot(&way) > least
+}
+
+/// The place of a body that is nearest to a point (m, world axes), no farther than `within` (m). Of
+/// the two sides of a groove it is that of the plane of the contact, as long as it is there.
+/// Without that a contact would alternate between the sides, and each time lose its force.
+fn on_side(
+    (probe, plane): (&Probe, &[Vector3<f64>; 2]),
+    shape: &Shape<'_>,
+    point: &Vector3<f64>,
+    within: f64,
+    hint: Option<&Place>,
+) -> Option<Near> {
+    let near = shape.nearest(point, within, hint)?;
+    if is_groove(probe, plane, &plane_of(&near, point)) {
+        return shape.nearest_of(point, &Side::Along(plane[1]), within, hint);
+    }
+    Some(near)
 }
 
 /// Whether a place of a probe that is near an existing contact with the same thing is no other.
@@ -99,12 +132,16 @@ pub(in super::super) fn begin_probes<P: Member>(
                     let spot = slide(probe, &memory.spot, false, |x| {
                         Ok(normal_of(shape.nearest(x, within, Some(&hint)), &mut hint))
                     })?;
-                    if is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
+                    let center = probe.begun(&spot.at);
+                    let near = on_side((probe, &memory.plane), &shape, &center, within, Some(&place));
+                    let near = near.unwrap_or_else(|| shape.at(&place, &center));
+                    let plane = plane_of(&near, &center);
+                    let same = |point: &ContactPoint, at: &AtProbe| {
+                        is_at_body(point, at, member, index) && !is_groove(probe, &plane, &at.plane)
+                    };
+                    if is_taken(work, same, &spot, radius) {
                         continue;
                     }
-                    let center = probe.begun(&spot.at);
-                    let near = shape.nearest(&center, within, Some(&place));
-                    let near = near.unwrap_or_else(|| shape.at(&place, &center));
                     let mut point = at_body(&view, &shape, member, &place, (probe, own, spot), &near);
                     point.gap = near.distance - radius;
                     let (normal, farthest) = (-near.normal, SNAPPED * shape.size);
@@ -211,10 +248,12 @@ fn compliance(view: &View<'_>, shape: &Shape<'_>, carriers: &Carriers) -> Matrix
     carrier_compliance(view, shape.sites, (shape.frame, shape.q), carriers)
 }
 
-/// Adds points for what the probes touch or are near. Returns whether any penetrates.
+/// Adds points for what the probes touch or are near. Returns whether any penetrates. `is_first`
+/// says that the step is computed for the first time.
 pub(in super::super) fn detect_probes<P: Member>(
     group: &Group<'_, P>,
     work: &mut Touching,
+    is_first: bool,
 ) -> Result<bool, StepError> {
     let mut penetrates = false;
     unite(group, work);
@@ -225,7 +264,7 @@ pub(in super::super) fn detect_probes<P: Member>(
         }
         for member in 0..group.len() {
             if probe.near.contains(&group.who[member]) {
-                penetrates |= detect_at_body(group, work, (index, span), member)?;
+                penetrates |= detect_at_body(group, work, (index, span), member, is_first)?;
             }
         }
     }
@@ -358,12 +397,13 @@ fn detect_at_obstacle<P: Member>(
 }
 
 /// As [`detect_at_obstacle`], at a body, with the places between corners that penetrate, one for
-/// each site.
+/// each site, and with both sides of a groove in which a ball lies.
 fn detect_at_body<P: Member>(
     group: &Group<'_, P>,
     work: &mut Touching,
     (index, span): (usize, usize),
     member: usize,
+    is_first: bool,
 ) -> Result<bool, StepError> {
     let (probe, view) = (&group.probes[index], group.view(member));
     let radius = probe.config().radius;
@@ -386,6 +426,9 @@ fn detect_at_body<P: Member>(
         let mut point = at_body(&view, &start, member, &near.place, (probe, (index, span), spot), &begun);
         point.gap = begun.distance - radius;
         point.passed = passed;
+        if let Some(side) = &mut point.probe {
+            side.plane = plane_of(near, &probe.ended(&spot.at));
+        }
         let ended = end.material(&near.place, &end.field.carriers(&near.place)).0;
         let slid = (ended - point.start) - (probe.carried(&spot.at, &near.normal) - from);
         point.anchor = point.start - from + share(point.gap, near.distance - radius) * slid;
@@ -438,6 +481,13 @@ fn detect_at_body<P: Member>(
             add(work, spot, &near, passed);
         }
     }
+    // In a step a ball does not go so far that it meets another side that was not near at first.
+    if is_first
+        && let Some((spot, near)) =
+            beside(probe, &end, work, |point, at| is_at_body(point, at, member, index))
+    {
+        add(work, spot, &near, false);
+    }
     // A soft surface is pressed along the whole length between corners.
     for (near, passed, spot) in between.drain(..) {
         if !is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
@@ -448,155 +498,24 @@ fn detect_at_body<P: Member>(
     Ok(penetrates)
 }
 
-/// Takes the gap of a point at a probe at the end of the computed step.
-pub(super) fn linearize_at_probe<P: Member>(
-    group: &Group<'_, P>,
-    point: &mut ContactPoint,
-    recovers: bool,
-) -> Result<(), StepError> {
-    let Some(mut at) = point.probe else { return Ok(()) };
-    let probe = &group.probes[at.probe];
-    let radius = probe.config().radius;
-    let far = is_far(probe, &at.spot) || point.passed;
-    let distance = match &at.first {
-        None => {
-            let Touched::Obstacle(index) = point.other else { return Ok(()) };
-            let Some(obstacle) = probe.obstacles().get(index) else { return Ok(()) };
-            if !far {
-                at.nearest = slide(probe, &at.spot, true, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
-            }
-            let x = probe.ended(&at.nearest.at);
-            if !far {
-                let found = look(&**obstacle, &x)?;
-                at.plane = [x - found.distance * found.normal, found.normal];
-            }
-            point.compliance = probe.rigid();
-            point.turn(&at.plane[1]);
-            at.carried = probe.carried(&at.spot.at, &at.plane[1]);
-            point.end = at.carried;
-            point.floor = floor(point.gap, RECOVERY_SPEED * radius * group.h, recovers);
-            at.plane[1].dot(&(x - at.plane[0])) - radius
-        }
-        Some((place, carriers)) => {
-            let view = group.view(point.member);
-            let Some([_, shape]) = group.shapes(point.member) else { return Ok(()) };
-            let mut last = at.last.unwrap_or(*place);
-            let within = reach(radius, shape.size);
-            if !far {
-                at.nearest = slide(probe, &at.spot, true, |x| {
-                    Ok(normal_of(shape.nearest(x, within, Some(&last)), &mut last))
-                })?;
-            }
-            let x = probe.ended(&at.nearest.at);
-            let near = if far { None } else { shape.nearest(&x, within, Some(&last)) };
-            let near = near.unwrap_or_else(|| shape.at(&last, &x));
-            (at.last, at.plane) = (Some(near.place), plane_of(&near, &x));
-            let (end, tangent): (_, Tangent) = shape.material(place, carriers);
-            point.end = end;
-            at.carried = probe.carried(&at.spot.at, &near.normal);
-            point.carried = at.carried - probe.begun(&at.spot.at);
-            point.compliance = compliance(&view, &shape, carriers);
-            point.turn(&-near.normal);
-            if point.mean.is_none() {
-                point.arm = near.at - Vector3::from(shape.frame.center());
-            }
-            let begun = point.tangent;
-            point.mean.get_or_insert_with(|| 0.5 * (begun + tangent));
-            point.floor = floor(point.gap, RECOVERY_SPEED * radius * group.h, recovers);
-            near.distance - radius
-        }
-    };
-    [_, at.arm] = probe.arms(&at.nearest.at, &at.plane[1]);
-    point.place = at.plane[0];
-    let from = if at.first.is_some() { at.carried } else { Vector3::zeros() };
-    let offset = point.axes * (point.end - from - point.anchor);
-    point.off = Vector3::new(distance - point.floor, offset[1], offset[2]);
-    point.probe = Some(at);
-    Ok(())
-}
-
-/// Sum of the forces of the points on a probe, N, and their torque about the tool point, N m.
-pub(in super::super) fn pull_on_probe(points: &[ContactPoint], index: usize) -> [Vector3<f64>; 2] {
-    let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
-    for point in points {
-        if let Some(at) = point.probe.as_ref().filter(|at| at.probe == index) {
-            let pull = if at.first.is_some() { -point.world_force() } else { point.world_force() };
-            force += pull;
-            torque += at.arm.cross(&pull);
-        }
-    }
-    [force, torque]
-}
-
-/// Writes the rows of the probes' springs. Their squares are the compliance.
-pub(in super::super) fn fill_probe_rows(probes: &[Probe], work: &mut Touching) {
-    for (point, sides) in work.points.iter().zip(&work.sides) {
-        let Some(at) = &point.probe else { continue };
-        // The force is on the probe at an obstacle, and against it at a body.
-        let (side, sign) = if at.first.is_some() { (sides[1], -1.0) } else { (sides[0], 1.0) };
-        let Some(side) = side else { continue };
-        let probe = &probes[at.probe];
-        let (root, turning) = (sign * probe.compliance.sqrt(), sign * probe.turning().sqrt());
-        let width = probe.width();
-        for axis in 0..3 {
-            let along = point.axes.row(axis).transpose();
-            let row = &mut work.rows[side.rows + width * axis..][..width];
-            row.iter_mut().zip(&along).for_each(|(x, axis)| *x = root * axis);
-            let turn = at.arm.cross(&along);
-            row.iter_mut().skip(3).zip(&turn).for_each(|(x, axis)| *x = turning * axis);
-        }
-    }
-}
-
-/// What the next step and users need of a contact of a probe. `None` for a memory of a contact
-/// without force.
-pub(in super::super) fn keep_at_probe<P: Member>(
-    group: &Group<'_, P>,
-    point: &ContactPoint,
-) -> Option<(usize, ProbeContact, Option<ProbeMemory>)> {
-    let at = point.probe?;
-    let pushes = point.pushed[0] > 0.0;
-    let force = if pushes { point.world_force() } else { Vector3::zeros() };
-    if !force.iter().all(|x| x.is_finite()) {
+/// The other side of the groove in which a ball lies that touches one, and the place of the ball.
+fn beside(
+    probe: &Probe,
+    shape: &Shape<'_>,
+    work: &Touching,
+    of: impl Fn(&ContactPoint, &AtProbe) -> bool,
+) -> Option<(Spot, Near)> {
+    if !probe.is_ball() {
         return None;
     }
-    let dent = point.compliance * force;
-    let held = point.pushed[1].hypot(point.pushed[2]);
-    let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
-    let h = group.h;
-    // The next step holds the material of the place of the probe that is nearest now.
-    let probe = &group.probes[at.probe];
-    let (x, spot) = (probe.ended(&at.nearest.at), at.nearest);
-    let (other, on_probe, velocity, compliance, memory) = match &at.first {
-        None => {
-            let anchor = if sliding { x + dent } else { point.anchor + (x - at.carried) };
-            let memory = ProbeMemory { other: point.other, force, anchor, spot, place: None };
-            (point.other, force, point.carried / h, Matrix3::zeros(), memory)
-        }
-        Some((place, carriers)) => {
-            let view = group.view(point.member);
-            let [start, end] = group.shapes(point.member)?;
-            let mut anchor = if sliding { point.end - x + dent } else { point.anchor - (x - at.carried) };
-            // It holds the material of the body that is nearest now, too.
-            let next = at.last.unwrap_or(*place);
-            let of = end.field.carriers(&next);
-            anchor += end.material(&next, &of).0 - end.material(place, carriers).0;
-            let other = Touched::Body(view.contacts.key);
-            let memory = ProbeMemory { other, force, anchor, spot, place: Some(next) };
-            let way = end.material(&next, &of).0 - start.material(&next, &of).0;
-            (other, -force, way / h, point.compliance, memory)
-        }
-    };
-    let contact = ProbeContact {
-        other,
-        point: at.plane[0].into(),
-        normal: at.plane[1].into(),
-        velocity: velocity.into(),
-        compliance: std::array::from_fn(|i| std::array::from_fn(|j| compliance[(i, j)])),
-        friction: point.friction,
-        spot: spot.at.into(),
-        force: on_probe.into(),
-        sliding: pushes && sliding,
-    };
-    Some((at.probe, contact, pushes.then_some(memory)))
+    let sides = work.points.iter().filter_map(|point| Some((point, point.probe?)));
+    let mut sides = sides.filter(|(point, at)| of(point, at));
+    let (Some((point, at)), None) = (sides.next(), sides.next()) else { return None };
+    if point.passed {
+        return None;
+    }
+    let center = probe.ended(&at.spot.at);
+    let reach = 2.0 * probe.config().radius;
+    let near = shape.nearest_of(&center, &Side::Beside(at.plane[1]), reach, at.last.as_ref())?;
+    is_groove(probe, &at.plane, &plane_of(&near, &center)).then_some((at.spot, near))
 }
