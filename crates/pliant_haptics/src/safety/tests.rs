@@ -314,3 +314,29 @@ fn a_spring_stretched_in_a_fade_is_felt_again_by_a_hand_that_rests() {
     assert!(repaid > 0.0 && repaid <= config.repay * 0.702 && repaid <= config.tank, "{repaid} J");
     assert!(out.port.available <= config.tank + 1e-12);
 }
+
+#[test]
+fn across_a_push_the_controller_brakes_no_harder_than_it_pushes() {
+    // A hand that was given more energy than there was leaves a surface: it is hardly pushed any
+    // more, and moves along the surface.
+    let braked = |one_sided: bool| {
+        let mut safety = engaged(1.0);
+        let given = Wanted {
+            moved: Vector3::new(2e-4, 0.0, 0.0),
+            velocity: Vector3::new(0.2, 0.0, 0.0),
+            ..wanted(1.0)
+        };
+        (0..200).for_each(|_| drop(safety.tick(&given)));
+        let leaving = Wanted {
+            moved: Vector3::new(0.0, 2e-4, 0.0),
+            velocity: Vector3::new(0.0, 0.2, 0.0),
+            one_sided,
+            ..wanted(1e-3)
+        };
+        let ticks = (0..200).map(|_| safety.tick(&leaving).force);
+        ticks.map(|force| force.y.abs()).fold(0.0, f64::max)
+    };
+    let [free, one_sided] = [false, true].map(braked);
+    assert!(free > 5e-3, "there is a debt to brake for: {free} N");
+    assert!(one_sided <= 1.001e-3, "{one_sided} N across a push of 1 mN");
+}
