@@ -22,8 +22,8 @@ pub(crate) struct ReportArgs {
     /// Fewer points and shorter timings: within ten minutes on two cores
     #[arg(long)]
     quick: bool,
-    /// Folder of the closed surfaces bunny.obj and armadillo.obj (see below); the own body stands in
-    /// for one that is missing
+    /// Folder of the closed surfaces bunny.obj and armadillo.obj (see below); the own body stands
+    /// in for one that is missing
     #[arg(long, value_name = "DIR", default_value = "models")]
     models: PathBuf,
     /// The project's own body: a surface or a scene

@@ -1,4 +1,5 @@
-//! What the pages say of the report's parts on elements, modes, steps, warp, elasticity and surfaces.
+//! What the pages say of the report's parts on elements, modes, steps, warp, elasticity and
+//! surfaces.
 
 use crate::page::{
     DECISIONS, LIMITS, MEASUREMENTS, PERFORMANCE, REPORT, line, number, range, row, says, says_range,

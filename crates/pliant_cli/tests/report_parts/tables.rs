@@ -101,8 +101,8 @@ fn the_default_is_told_of_our_own_body() {
             assert!(row.along <= row.whole + 0.55, "{row:?}");
         }
     }
-    // What a step takes: of 60 linear modes on both meshes alike, as much as one of 60 modes that is
-    // timed here, and much more with the energy of reduced elasticity.
+    // What a step takes: of 60 linear modes on both meshes alike, as much as one of 60 modes that
+    // is timed here, and much more with the energy of reduced elasticity.
     let fastest = |rows: &[Pulled]| rows.iter().map(|row| row.step_us).fold(f64::INFINITY, f64::min);
     let [four_us, ten_us, reduced_us] = [&of_four, &of_ten, &of_reduced].map(|rows| fastest(rows));
     let here_us = step_of_60_modes_us();
@@ -190,8 +190,8 @@ fn the_papers_figures_have_their_curves_and_say_how_far_each_is_off() {
                 }
                 assert!(compared > shown.len() / 2, "{figure}, {row:?}: {compared} ticks");
                 let drawn = off.iter().fold(0.0f64, |most, x| most.max(x.abs()));
-                // Both are shares of one largest value. The table has three decimals and the file four
-                // digits, and what is far off is cut.
+                // Both are shares of one largest value. The table has three decimals and the file
+                // four digits, and what is far off is cut.
                 if told < 50.0 {
                     assert!((drawn - told).abs() < 6e-4 + 5e-4 * told, "{figure}, {row:?}: {drawn}");
                 }

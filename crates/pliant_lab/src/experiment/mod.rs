@@ -164,8 +164,8 @@ pub struct Metrics {
     /// to the first step whose force has that position or a newer one, and no number if that peer
     /// holds nothing. Between host and guest it is half the round trip, half a step and the mean
     /// visual delay, and no number if the policy owns the model: the guest's own copy answers then,
-    /// at its next step (see [`pliant_stream::StreamedBody::predicted_hand`]), which is not measured
-    /// here.
+    /// at its next step (see [`pliant_stream::StreamedBody::predicted_hand`]), which is not
+    /// measured here.
     pub hand_to_force_ms: f64,
     /// Mean time from the host's step to the showing of its tick, ms.
     ///

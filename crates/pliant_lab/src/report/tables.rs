@@ -89,9 +89,9 @@ pub(super) fn precision() -> Result<Figure, LabError> {
     })
 }
 
-/// A row of the paper's table 2: name, tetrahedra, modes, bake time (s) and steps a second. The paper
-/// has these with its compensation and without. Which of the two this column is was not noted when
-/// it was copied, and the other one was not copied.
+/// A row of the paper's table 2: name, tetrahedra, modes, bake time (s) and steps a second. The
+/// paper has these with its compensation and without. Which of the two this column is was not noted
+/// when it was copied, and the other one was not copied.
 const PAPER: [(&str, usize, usize, f64, f64); 4] = [
     ("bar", 1_080, 20, 0.11, 1124.2),
     ("bunny", 50_000, 60, 14.7, 264.2),
