@@ -38,6 +38,9 @@ struct Run {
     environment: Vec<(String, String)>,
     /// Texts that the output must contain, in this order.
     prints: Vec<String>,
+    /// Texts that the output must not contain.
+    #[serde(default)]
+    lacks: Vec<String>,
     /// Files that must exist afterward and must not be empty.
     #[serde(default)]
     writes: Vec<String>,
@@ -235,6 +238,9 @@ fn run_in(run: &Run, folder: &Path) -> Result<(), String> {
             Some((_, after)) => rest = after,
             None => return Err(format!("expected {words:?} in:\n{printed}")),
         }
+    }
+    if let Some(words) = run.lacks.iter().find(|words| printed.contains(*words)) {
+        return Err(format!("did not expect {words:?} in:\n{printed}"));
     }
     for file in &run.writes {
         if fs::metadata(folder.join(file)).map_or(0, |found| found.len()) == 0 {
