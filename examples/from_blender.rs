@@ -25,7 +25,10 @@ use bevy::{
 };
 use clap::Parser;
 use pliant::{
-    body::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeFailed, BakeNode, BakePlugin},
+    body::{
+        ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS, BakeFailed, BakeNode, BakePlugin,
+        BakeSettings,
+    },
     prelude::*,
 };
 use stage::{Awaited, Readout, Stage};
@@ -107,7 +110,8 @@ fn bake_what_says_so(
     mut bake: ResMut<Bake>,
 ) {
     for (node, extras) in nodes.iter().filter(|(_, extras)| extras.value.contains("stiffness")) {
-        match (BakeNode { tets: bake.tets, ..default() }).with_extras(&extras.value) {
+        let settings = BakeSettings { tets: bake.tets, ..default() };
+        match (BakeNode { settings }).with_extras(&extras.value) {
             Ok(made) => {
                 bake.asked += 1;
                 commands.entity(node).insert(made);

@@ -11,12 +11,13 @@ use bevy::{
         AssetMode, LoadState,
         processor::{AssetProcessor, FileTransactionLogFactory},
     },
-    gltf::GltfMaterialName,
+    gltf::{GltfExtras, GltfMaterialName},
     mesh::{VertexAttributeValues, skinning::SkinnedMesh},
     prelude::*,
 };
+use bevy_skein::SkeinPlugin;
 use pliant::{
-    body::{BakePlugin, SurfacePart},
+    body::{BakeFailed, BakePlugin, SurfacePart},
     prelude::*,
 };
 
@@ -27,6 +28,64 @@ fn positions(app: &App, part: Entity) -> Vec<Vec3> {
     match mesh.attribute(Mesh::ATTRIBUTE_POSITION) {
         Some(VertexAttributeValues::Float32x3(values)) => values.iter().map(|p| Vec3::from(*p)).collect(),
         _ => panic!("no positions"),
+    }
+}
+
+/// Spawns what Bevy makes of a node whose extras Skein for Blender has written: the node, and a
+/// child with its mesh.
+fn node_of_skein(app: &mut App, settings: &str) -> Entity {
+    let mesh = app.world_mut().resource_mut::<Assets<Mesh>>().add(Cuboid::new(0.1, 0.2, 0.1));
+    let value = format!(
+        r#"{{ "skein": [{{ "pliant_body::bake::node::BakeNode": {{ "settings": {settings} }} }}] }}"#
+    );
+    app.world_mut().spawn((GltfExtras { value }, Transform::default(), children![Mesh3d(mesh)])).id()
+}
+
+#[test]
+fn skein_makes_a_body_of_a_node_with_its_settings() {
+    let mut app = bud::empty(false, |app| {
+        app.add_plugins(SkeinPlugin { handle_brp: false });
+    });
+    let settings =
+        r#"{ "tets": 500, "modes": 8, "material": "linear", "young": 3e4, "anchors": ["y<-0.09"] }"#;
+    let node = node_of_skein(&mut app, settings);
+    assert_eq!(bud::body(&mut app), node);
+    let model = app.world().get::<BodyState>(node).unwrap().model();
+    let info = model.info();
+    assert_eq!(
+        (model.mode_count(), info.young, info.density),
+        (8, 3e4, 1000.0),
+        "the density is the default"
+    );
+    assert!(!model.is_free(), "it is fixed at its bottom");
+}
+
+#[derive(Resource, Default)]
+struct Failed(Vec<(Entity, String)>);
+
+#[test]
+fn settings_that_cannot_be_read_make_no_body_and_say_why() {
+    let mut app = bud::empty(false, |app| {
+        app.add_plugins(SkeinPlugin { handle_brp: false }).init_resource::<Failed>().add_observer(
+            |failed: On<BakeFailed>, mut all: ResMut<Failed>| {
+                all.0.push((failed.entity, failed.error.to_string()));
+            },
+        );
+    });
+    for (settings, expected) in [
+        (r#"{ "anchors": ["left"] }"#, "expected an axis"),
+        (r#"{ "material": "cheese" }"#, "cheese"),
+        (r#"{ "young": -1.0 }"#, "-1"),
+    ] {
+        let node = node_of_skein(&mut app, settings);
+        for _ in 0..600 {
+            app.update();
+            if !app.world().resource::<Failed>().0.is_empty() {
+                break;
+            }
+        }
+        let told = std::mem::take(&mut app.world_mut().resource_mut::<Failed>().0);
+        assert!(matches!(&told[..], [(of, why)] if *of == node && why.contains(expected)), "{told:?}");
     }
 }
 
@@ -137,6 +196,10 @@ fn a_file_is_baked_when_assets_are_processed() {
     fs::copy(&glb, assets.join("bud.glb")).unwrap();
     let settings = r#"(tets: 2000, modes: 8, young: 2e4, density: 400, anchors: ["y<0.08"])"#;
     fs::write(assets.join("bud.glb.meta"), meta(settings)).unwrap();
+    // The anchor of this one is painted, and nothing else fixes it.
+    fs::copy(&glb, assets.join("painted.glb")).unwrap();
+    fs::write(assets.join("painted.glb.meta"), meta(r#"(tets: 1200, material: "linear", modes: 6)"#))
+        .unwrap();
     fs::copy(&glb, assets.join("bad.glb")).unwrap();
     fs::write(assets.join("bad.glb.meta"), meta(r#"(anchors: ["left"])"#)).unwrap();
 
@@ -146,6 +209,8 @@ fn a_file_is_baked_when_assets_are_processed() {
     assert_eq!(baked.surface().triangles().len(), 720, "the surface of the file");
     assert!(baked.surface().uvs().is_some());
     println!("processed: {} tetrahedra, {:.3} kg", baked.info().tets, baked.mass());
+    let ModalAsset(painted) = load(&mut app, "painted.glb").unwrap();
+    assert_eq!((painted.mode_count(), painted.is_free()), (6, false));
     let error = load(&mut app, "bad.glb").unwrap_err();
     println!("{error}");
     drop(app);

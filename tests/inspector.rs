@@ -17,13 +17,12 @@ use pliant::{
 };
 
 /// What an inspector can only name, and why.
-const OPAQUE: [(&str, &str); 4] = [
+const OPAQUE: [(&str, &str); 3] = [
     (
         "VisualState",
         "what is shown, not a setting: the two poses between which it goes on are not made by hand",
     ),
     ("SurfacePart", "a part of a drawn mesh: Bevy's `Range` has no inspector"),
-    ("BakeNode", "its material and anchors are data of `pliant_bake`, which knows no engine"),
     ("SavedState", "the state of a solver, as it is saved"),
 ];
 

@@ -146,6 +146,7 @@ pub fn meshes(bytes: &[u8]) {
     let path = FOLDER.with(|folder| folder.0.join(format!("any.{ending}")));
     std::fs::write(&path, rest).expect("a temporary file");
     let _ = io::read(&path);
+    let _ = io::read_painted(&path, &["_STIFFNESS", "_DENSITY", "_ANCHOR"]);
 }
 
 /// Recordings of devices. Their samples must be finite.

@@ -11,12 +11,22 @@ use bevy::{
     world_serialization::WorldAssetRoot,
 };
 use pliant::{
-    body::{ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeNode, BakePlugin},
+    body::{ATTRIBUTE_ANCHOR, ATTRIBUTE_STIFFNESS, BakeNode, BakePlugin, BakeSettings},
     prelude::*,
 };
 
 /// Returns an app that loads the scene of `bud.glb` and bakes its nodes that say so.
 pub fn app(draws: bool) -> App {
+    let mut app = empty(draws, |app| {
+        app.add_systems(Update, bake_what_says_so);
+    });
+    let scene = app.world().resource::<AssetServer>().load(GltfAssetLabel::Scene(0).from_asset("bud.glb"));
+    app.world_mut().spawn(WorldAssetRoot(scene));
+    app
+}
+
+/// Returns an app that reads and bakes models, with what `add` adds.
+pub fn empty(draws: bool, add: impl FnOnce(&mut App)) -> App {
     let gltf = GltfPlugin::default()
         .add_custom_vertex_attribute("STIFFNESS", ATTRIBUTE_STIFFNESS)
         .add_custom_vertex_attribute("ANCHOR", ATTRIBUTE_ANCHOR);
@@ -36,15 +46,13 @@ pub fn app(draws: bool) -> App {
     app.add_plugins(plugins)
         .add_plugins((ScheduleRunnerPlugin::run_once(), PliantPlugins::default(), BakePlugin { cache: None }))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
-        .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
-        .add_systems(Update, bake_what_says_so);
+        .insert_resource(TimeUpdateStrategy::FixedTimesteps(1));
+    add(&mut app);
     while app.plugins_state() == PluginsState::Adding {
         bevy::tasks::tick_global_task_pools_on_main_thread();
     }
     app.finish();
     app.cleanup();
-    let scene = app.world().resource::<AssetServer>().load(GltfAssetLabel::Scene(0).from_asset("bud.glb"));
-    app.world_mut().spawn(WorldAssetRoot(scene));
     app
 }
 
@@ -53,10 +61,9 @@ fn bake_what_says_so(
     nodes: Query<(Entity, &GltfExtras), Added<GltfExtras>>,
 ) -> Result {
     for (node, extras) in nodes.iter().filter(|(_, extras)| extras.value.contains("stiffness")) {
-        let mut bake = BakeNode { tets: 4_000, ..default() }.with_extras(&extras.value)?;
         // What is looked at is where parts and vertices go, for which linear elasticity suffices.
-        (bake.config.material, bake.config.modes) = (None, 12);
-        commands.entity(node).insert(bake);
+        let settings = BakeSettings { tets: 4_000, material: "linear".into(), modes: 12, ..default() };
+        commands.entity(node).insert(BakeNode { settings }.with_extras(&extras.value)?);
     }
     Ok(())
 }

@@ -1,9 +1,13 @@
 //! Materials that vary within a body: regions between half-spaces, and values painted on a surface.
 
 use std::fmt;
+use std::path::Path;
 use std::str::FromStr;
 
-use pliant_mesh::{Surface, SurfaceLocator};
+use pliant_mesh::{
+    MeshError, Surface, SurfaceLocator,
+    io::{self, Input},
+};
 
 use crate::fem::FeMesh;
 use crate::{Anchor, AnchorSyntax, BakeConfig, BakeError};
@@ -103,6 +107,77 @@ impl Paint {
         Self { surface, stiffness: Vec::new(), density: Vec::new(), anchored: Vec::new() }
     }
 
+    /// The attributes of a glTF file that are read: of stiffness, density and anchor.
+    pub const ATTRIBUTES: [&str; 3] = ["_STIFFNESS", "_DENSITY", "_ANCHOR"];
+
+    /// Returns a painting of a surface with numbers at its vertices, in the order of
+    /// [`Paint::ATTRIBUTES`]. `None` if nothing is painted. A vertex whose number is NaN is not
+    /// painted: its factors are 1, and it is not fixed.
+    pub fn of_values(surface: &Surface, values: [Vec<f64>; 3]) -> Option<Self> {
+        if values.iter().all(Vec::is_empty) {
+            return None;
+        }
+        let or = |unpainted: f64, mut values: Vec<f64>| {
+            values.iter_mut().filter(|value| value.is_nan()).for_each(|value| *value = unpainted);
+            values
+        };
+        let [stiffness, density, anchored] = values;
+        Some(Self {
+            surface: surface.clone(),
+            stiffness: or(1.0, stiffness),
+            density: or(1.0, density),
+            anchored: or(0.0, anchored),
+        })
+    }
+
+    /// Reads a file as [`io::read`] does, and what is painted on its surface.
+    ///
+    /// # Errors
+    /// Returns the errors of [`io::read`].
+    pub fn read(path: impl AsRef<Path>) -> Result<(Input, Option<Self>), MeshError> {
+        let path = path.as_ref();
+        match io::read_painted(path, &Self::ATTRIBUTES) {
+            Ok(read) => {
+                let (surface, paint) = Self::with_surface(read);
+                Ok((Input::Surface(surface), paint))
+            }
+            Err(MeshError::UnknownFormat { .. }) => Ok((io::read(path)?, None)),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Reads a surface from the bytes of a file ([`io::parse_painted`]), and what is painted on it.
+    ///
+    /// # Errors
+    /// Returns the errors of [`io::parse_painted`].
+    pub fn parse(path: impl AsRef<Path>, bytes: &[u8]) -> Result<(Surface, Option<Self>), MeshError> {
+        io::parse_painted(path, bytes, &Self::ATTRIBUTES).map(Self::with_surface)
+    }
+
+    fn with_surface((surface, values): (Surface, Vec<Vec<f32>>)) -> (Surface, Option<Self>) {
+        let mut values = values.into_iter().map(|list| list.into_iter().map(f64::from).collect());
+        let values = std::array::from_fn(|_| values.next().unwrap_or_default());
+        let paint = Self::of_values(&surface, values);
+        (surface, paint)
+    }
+
+    /// Checks the surface and the painted values. A bake does so too.
+    ///
+    /// # Errors
+    /// Returns [`BakeError::Paint`] for a bad surface, and [`BakeError::Parameter`] for a list of
+    /// another length and for a value out of range.
+    pub fn check(&self) -> Result<(), BakeError> {
+        self.surface.check().map_err(BakeError::Paint)?;
+        let vertices = self.surface.positions.len();
+        let lengths = [&self.stiffness, &self.density, &self.anchored].map(Vec::len);
+        let fits = |n: f64| n == 0.0 || n == vertices as f64;
+        let lengths = lengths.into_iter().map(|n| n as f64);
+        each("painted values", "one for each vertex of the painted surface, or none", &fits, lengths)?;
+        each("painted stiffness", "1e-6 to 1e6", &is_stiffness, self.stiffness.iter().copied())?;
+        each("painted density", "1e-3 to 1e3", &is_density, self.density.iter().copied())?;
+        each("painted anchor", "a finite weight", &f64::is_finite, self.anchored.iter().copied())
+    }
+
     /// Returns whether some vertex has a weight of the anchor above 1/2.
     pub fn anchors(&self) -> bool {
         self.anchored.iter().any(|&weight| weight > ANCHORED_FROM)
@@ -117,32 +192,32 @@ const STIFFNESS: std::ops::RangeInclusive<f64> = 1e-6..=1e6;
 /// Factors of the density.
 const DENSITY: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 
+/// Refuses the first value that is not `ok`.
+fn each(
+    name: &'static str,
+    expected: &'static str,
+    ok: &dyn Fn(f64) -> bool,
+    mut values: impl Iterator<Item = f64>,
+) -> Result<(), BakeError> {
+    values.find(|&x| !ok(x)).map_or(Ok(()), |got| Err(BakeError::Parameter { name, expected, got }))
+}
+
 /// Checks the factors of regions and painting.
 pub(crate) fn check(config: &BakeConfig) -> Result<(), BakeError> {
-    fn each(
-        name: &'static str,
-        expected: &'static str,
-        ok: &dyn Fn(f64) -> bool,
-        mut values: impl Iterator<Item = f64>,
-    ) -> Result<(), BakeError> {
-        values.find(|&x| !ok(x)).map_or(Ok(()), |got| Err(BakeError::Parameter { name, expected, got }))
-    }
-    let (stiff, dense) = (|x: f64| STIFFNESS.contains(&x), |x: f64| DENSITY.contains(&x));
     let regions = &config.regions;
     let count = regions.len() as f64;
     each("regions", "at most 64", &|n| n <= 64.0, std::iter::once(count))?;
-    each("stiffness of a region", "1e-6 to 1e6", &stiff, regions.iter().map(|r| r.stiffness))?;
-    each("density of a region", "1e-3 to 1e3", &dense, regions.iter().map(|r| r.density))?;
-    let Some(paint) = &config.paint else { return Ok(()) };
-    paint.surface.check().map_err(BakeError::Paint)?;
-    let vertices = paint.surface.positions.len();
-    let lengths = [&paint.stiffness, &paint.density, &paint.anchored].map(Vec::len);
-    let fits = |n: f64| n == 0.0 || n == vertices as f64;
-    let lengths = lengths.into_iter().map(|n| n as f64);
-    each("painted values", "one for each vertex of the painted surface, or none", &fits, lengths)?;
-    each("painted stiffness", "1e-6 to 1e6", &stiff, paint.stiffness.iter().copied())?;
-    each("painted density", "1e-3 to 1e3", &dense, paint.density.iter().copied())?;
-    each("painted anchor", "a finite weight", &f64::is_finite, paint.anchored.iter().copied())
+    each("stiffness of a region", "1e-6 to 1e6", &is_stiffness, regions.iter().map(|r| r.stiffness))?;
+    each("density of a region", "1e-3 to 1e3", &is_density, regions.iter().map(|r| r.density))?;
+    config.paint.as_ref().map_or(Ok(()), Paint::check)
+}
+
+fn is_stiffness(factor: f64) -> bool {
+    STIFFNESS.contains(&factor)
+}
+
+fn is_density(factor: f64) -> bool {
+    DENSITY.contains(&factor)
 }
 
 /// Value of a list at a place of the painted surface.
@@ -195,6 +270,30 @@ pub(crate) fn vary(fe: &mut FeMesh, config: &BakeConfig) -> Result<(), BakeError
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_painted_in_a_file_is_read_with_its_surface() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/blender/bud.glb");
+        let (input, paint) = Paint::read(path).unwrap();
+        let Input::Surface(surface) = input else { panic!("expected a surface") };
+        let paint = paint.unwrap();
+        assert_eq!(paint.surface, surface);
+        assert!(paint.anchors() && paint.anchored.iter().any(|&weight| weight < 0.5));
+        assert_eq!(paint.stiffness.len(), surface.positions.len());
+        assert!(paint.stiffness.iter().any(|&factor| factor > 1.5), "a stiff part");
+        assert!(paint.stiffness.iter().all(|factor| STIFFNESS.contains(factor)));
+        assert!(paint.density.is_empty(), "nothing of it is painted");
+        assert!(paint.check().is_ok());
+        // A new attribute of a modeler is 0 everywhere.
+        let new = Paint { density: vec![0.0; surface.positions.len()], ..paint.clone() };
+        let error = new.check().unwrap_err().to_string();
+        assert!(error.contains("painted density") && error.contains('0'), "{error}");
+        assert_eq!(Paint::parse(path, &std::fs::read(path).unwrap()).unwrap(), (surface, Some(paint)));
+        // A scene has no surface to paint on.
+        let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bud.ron");
+        assert!(matches!(Paint::read(scene), Ok((Input::Sdf(_), None))));
+        assert!(Paint::read("nowhere.glb").is_err() && Paint::read("nowhere.ron").is_err());
+    }
 
     #[test]
     fn a_region_is_read_as_it_is_written() {

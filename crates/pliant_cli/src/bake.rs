@@ -5,7 +5,10 @@ use std::time::Instant;
 
 use clap::Args;
 use pliant_bake::{Anchor, BakeCache, BakeConfig, Region, Stage, bake_cached};
-use pliant_lab::{Progress, fill::fill};
+use pliant_lab::{
+    Progress,
+    fill::{Filled, fill},
+};
 use pliant_mesh::{Repair, io};
 use pliant_modal::{Damping, Element, ModalModel};
 use serde::Serialize;
@@ -19,7 +22,7 @@ const MAX_THREADS: usize = 1024;
 #[derive(Args, Debug)]
 pub(crate) struct BakeArgs {
     /// A surface, repaired if needed (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra
-    /// (.msh, .vtk, .mesh, .veg)
+    /// (.msh, .vtk, .mesh, .veg). Of a glTF file the painted _STIFFNESS, _DENSITY and _ANCHOR count
     input: PathBuf,
     /// Approximate number of tetrahedra for a surface or a scene [default: 10000]
     #[arg(long, allow_negative_numbers = true)]
@@ -49,8 +52,8 @@ pub(crate) struct BakeArgs {
     /// Fraction of critical damping in every mode [default: 0.03]
     #[arg(long, value_name = "Z", allow_hyphen_values = true)]
     damping_ratio: Option<f64>,
-    /// Fixes the nodes of a half-space, such as 'x<0.01' (m). Repeatable. Without it the body is
-    /// free
+    /// Fixes the nodes of a half-space, such as 'x<0.01' (m). Repeatable. Without an anchor, given
+    /// or painted, the body is free
     #[arg(long = "anchor", value_name = "AXIS<NUMBER", allow_hyphen_values = true)]
     anchors: Vec<Anchor>,
     /// Makes a part of the body stiffer or heavier, such as 'x>0.2 & y<0.1: stiffness 50, density
@@ -174,7 +177,8 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
 
     let mut bar = Bar::new();
     let skin = args.skin.map(io::read_surface).transpose()?;
-    let (mesh, repair) = fill(&args.input, args.tets, &mut bar)?;
+    let Filled { mesh, repair, paint } = fill(&args.input, args.tets, &mut bar)?;
+    let config = BakeConfig { paint, ..config };
     let mesh_seconds = start.elapsed().as_secs_f64();
     let mut progress = |stage, share| {
         let stage = match stage {

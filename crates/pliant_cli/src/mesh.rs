@@ -128,7 +128,7 @@ pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
             // Clap requires both arguments if there is no shape.
             let (input, output) = (args.input.unwrap_or_default(), args.output.unwrap_or_default());
             args.msh.check(&output)?;
-            (fill(&input, args.tets, &mut Bar::new())?.0, output, args.msh)
+            (fill(&input, args.tets, &mut Bar::new())?.mesh, output, args.msh)
         }
     };
     msh.write(&path, &mesh)?;

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use pliant_bake::Paint;
 use pliant_mesh::{Repair, StuffOptions, TetMesh, io};
 
 use crate::{LabError, progress::Progress};
@@ -12,6 +13,16 @@ const DEFAULT_TETS: usize = 10_000;
 /// Share of a surface's volume that a fill may lose without a warning.
 const VOLUME_LOSS: f64 = 0.02;
 
+/// What a file was filled with.
+pub struct Filled {
+    /// The tetrahedra.
+    pub mesh: TetMesh,
+    /// The repair of a defective surface.
+    pub repair: Option<Repair>,
+    /// What is painted on the surface.
+    pub paint: Option<Paint>,
+}
+
 /// Returns the tetrahedra that a file holds, or fills the file's shape with about `tets` tetrahedra
 /// (default: 10,000).
 ///
@@ -19,15 +30,14 @@ const VOLUME_LOSS: f64 = 0.02;
 /// coarse that it rounds off much of a surface is reported as a warning.
 ///
 /// # Errors
-/// Returns [`LabError::Mesh`] when the file cannot be read or filled, or [`LabError::TetsGiven`]
+/// Returns [`LabError::Mesh`] when the file cannot be read or filled, [`LabError::Bake`] when what
+/// is painted is out of range, or [`LabError::TetsGiven`]
 /// when `tets` is given for a file that already holds tetrahedra.
-pub fn fill(
-    input: &Path,
-    tets: Option<usize>,
-    progress: &mut dyn Progress,
-) -> Result<(TetMesh, Option<Repair>), LabError> {
+pub fn fill(input: &Path, tets: Option<usize>, progress: &mut dyn Progress) -> Result<Filled, LabError> {
     progress.report("read", 0.0);
-    let read = io::read(input)?;
+    let (read, paint) = Paint::read(input)?;
+    // Before the long work.
+    paint.as_ref().map_or(Ok(()), Paint::check)?;
     if tets.is_some() && matches!(read, io::Input::Tets(_)) {
         return Err(LabError::TetsGiven(input.to_path_buf()));
     }
@@ -38,7 +48,7 @@ pub fn fill(
         progress.warn(&format!("{} was mended: {repair}", input.display()));
         // The volume of a defective surface does not measure the fill, because of holes and parts
         // that count twice.
-        return Ok((mesh, Some(repair)));
+        return Ok(Filled { mesh, repair: Some(repair), paint });
     }
     let filled = mesh.volume();
     if filled < (1.0 - VOLUME_LOSS) * enclosed {
@@ -48,5 +58,5 @@ pub fn fill(
             input.display()
         ));
     }
-    Ok((mesh, None))
+    Ok(Filled { mesh, repair: None, paint })
 }

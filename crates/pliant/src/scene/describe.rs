@@ -162,7 +162,8 @@ pub struct BakeEntry {
     /// Damping ratio of every mode (1 is critical damping), 0 to 1000. Default: 0.03.
     #[serde(default = "damping_ratio")]
     pub damping_ratio: f64,
-    /// Half-spaces that are fixed, such as `"y<0.02"`. Default: none, which gives a free body.
+    /// Half-spaces that are fixed, such as `"y<0.02"`, beside what is painted in the file. Default:
+    /// none, which gives a free body.
     #[serde(default)]
     pub anchors: Vec<String>,
     /// Parts that are stiffer or heavier, such as `"y>0.2 & x<0: stiffness 50, density 1.5"`, at

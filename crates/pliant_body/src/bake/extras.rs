@@ -1,6 +1,6 @@
 //! Anchors and materials that a modeling program has stored with a model.
 
-use pliant_bake::{Anchor, AnchorSyntax, BakeConfig};
+use pliant_bake::{Anchor, AnchorSyntax};
 use serde::Deserialize;
 use thiserror::Error;
 
@@ -32,6 +32,24 @@ enum Anchors {
     Many(Vec<String>),
 }
 
+impl Extras {
+    fn read(json: &str) -> Result<Self, BakeExtrasError> {
+        let unread = |error: serde_json::Error| BakeExtrasError::Json(error.to_string());
+        // A list would be read as the properties in their order.
+        let object: serde_json::Map<String, serde_json::Value> =
+            serde_json::from_str(json).map_err(unread)?;
+        Self::deserialize(serde_json::Value::Object(object)).map_err(unread)
+    }
+
+    fn anchors(&self) -> Vec<String> {
+        match &self.anchor {
+            None => Vec::new(),
+            Some(Anchors::One(one)) => vec![one.clone()],
+            Some(Anchors::Many(many)) => many.clone(),
+        }
+    }
+}
+
 impl BakeRequest {
     /// Takes anchors and material from the custom properties of a model, which glTF calls extras:
     /// the JSON text in Bevy's `GltfExtras` of a node, or in its `GltfMeshExtras`.
@@ -53,7 +71,12 @@ impl BakeRequest {
     /// # }
     /// ```
     pub fn with_extras(mut self, json: &str) -> Result<Self, BakeExtrasError> {
-        take(&mut self.config, json)?;
+        let extras = Extras::read(json)?;
+        for anchor in &extras.anchors() {
+            self.config.anchors.push(anchor.parse()?);
+        }
+        self.config.young = extras.stiffness.unwrap_or(self.config.young);
+        self.config.density = extras.density.unwrap_or(self.config.density);
         Ok(self)
     }
 }
@@ -65,25 +88,14 @@ impl BakeNode {
     /// # Errors
     /// Returns the errors of [`BakeRequest::with_extras`].
     pub fn with_extras(mut self, json: &str) -> Result<Self, BakeExtrasError> {
-        take(&mut self.config, json)?;
+        let extras = Extras::read(json)?;
+        let settings = &mut self.settings;
+        for anchor in extras.anchors() {
+            anchor.parse::<Anchor>()?;
+            settings.anchors.push(anchor);
+        }
+        settings.young = extras.stiffness.unwrap_or(settings.young);
+        settings.density = extras.density.unwrap_or(settings.density);
         Ok(self)
     }
-}
-
-fn take(config: &mut BakeConfig, json: &str) -> Result<(), BakeExtrasError> {
-    let unread = |error: serde_json::Error| BakeExtrasError::Json(error.to_string());
-    // A list would be read as the properties in their order.
-    let object: serde_json::Map<String, serde_json::Value> = serde_json::from_str(json).map_err(unread)?;
-    let extras = Extras::deserialize(serde_json::Value::Object(object)).map_err(unread)?;
-    let anchors = match extras.anchor {
-        None => Vec::new(),
-        Some(Anchors::One(one)) => vec![one],
-        Some(Anchors::Many(many)) => many,
-    };
-    for anchor in anchors {
-        config.anchors.push(anchor.parse::<Anchor>()?);
-    }
-    config.young = extras.stiffness.unwrap_or(config.young);
-    config.density = extras.density.unwrap_or(config.density);
-    Ok(())
 }

@@ -63,12 +63,8 @@ pub(super) fn resolve(
     let Some(meshes) = loaded(handles, meshes, server)? else { return Ok(None) };
     let mut surface = Surface::default();
     let mut uvs = Values::new([0.0; 2]);
-    // What is not painted is as baked without paint.
-    let mut paint = [
-        (ATTRIBUTE_STIFFNESS, Values::new(1.0)),
-        (ATTRIBUTE_DENSITY, Values::new(1.0)),
-        (ATTRIBUTE_ANCHOR, Values::new(0.0)),
-    ];
+    let mut paint = [ATTRIBUTE_STIFFNESS, ATTRIBUTE_DENSITY, ATTRIBUTE_ANCHOR]
+        .map(|attribute| (attribute, Values::new(f64::NAN)));
     for mesh in meshes {
         let MeshTriangles { positions, triangles } = triangles(mesh)?;
         let (first, count) = (surface.positions.len() as u32, positions.len());
@@ -88,10 +84,9 @@ pub(super) fn resolve(
     }
     surface.uvs = Some(uvs.all).filter(|_| uvs.any);
     let mut config = request.config.clone();
-    if config.paint.is_none() && paint.iter().any(|(_, values)| values.any) {
-        let [stiffness, density, anchored] =
-            paint.map(|(_, values)| if values.any { values.all } else { Vec::new() });
-        config.paint = Some(Paint { surface: surface.clone(), stiffness, density, anchored });
+    if config.paint.is_none() {
+        let painted = paint.map(|(_, values)| if values.any { values.all } else { Vec::new() });
+        config.paint = Paint::of_values(&surface, painted);
     }
     Ok(Some(BakeRequest { shape: surface.into(), config, ..request.clone() }))
 }

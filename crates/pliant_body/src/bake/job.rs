@@ -1,11 +1,8 @@
 //! One bake on its own threads.
 
-use std::{
-    path::Path,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, AtomicU64, Ordering},
-    },
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, AtomicU64, Ordering},
 };
 
 use bevy::{
@@ -13,7 +10,7 @@ use bevy::{
     prelude::*,
     tasks::{AsyncComputeTaskPool, Task, block_on, poll_once},
 };
-use pliant_bake::{BakeCache, Stage, bake, bake_cached};
+use pliant_bake::{BakeCache, BakeConfig, Paint, Stage, bake, bake_cached};
 use pliant_mesh::{
     Repair, StuffOptions, Surface, TetMesh,
     io::{self, Input},
@@ -108,10 +105,16 @@ fn run(
         .build()
         .map_err(|error| BakeBodyError::Threads(error.to_string()))?;
     threads.install(|| {
-        let (mesh, skin, repair) = mesh(request, shared)?;
+        let (mesh, skin, repair, paint) = mesh(request, shared)?;
         if shared.is_canceled() {
             return Ok(Outcome::Cancelled);
         }
+        let config = match paint {
+            Some(paint) if request.config.paint.is_none() => {
+                &BakeConfig { paint: Some(paint), ..request.config.clone() }
+            }
+            _ => &request.config,
+        };
         let mut progress = |stage, share| {
             let stage = match stage {
                 Stage::Assemble => 1,
@@ -124,26 +127,27 @@ fn run(
         };
         let (model, cached) = match cache {
             Some(cache) => {
-                let made = bake_cached(cache, &mesh, skin.as_ref(), &request.config, &mut progress)?;
+                let made = bake_cached(cache, &mesh, skin.as_ref(), config, &mut progress)?;
                 if let Some(error) = made.not_kept {
                     warn!("a bake is not kept in {}: {error}", cache.folder().display());
                 }
                 (made.bake.model, made.cached)
             }
-            None => (bake(&mesh, skin.as_ref(), &request.config, &mut progress)?.model, false),
+            None => (bake(&mesh, skin.as_ref(), config, &mut progress)?.model, false),
         };
         Ok(Outcome::Baked { model: Box::new(model), seconds: start.elapsed().as_secs_f64(), cached, repair })
     })
 }
 
-/// Returns the tetrahedra, the visible surface if it is not their boundary, and the repair of the
-/// input.
+/// Returns the tetrahedra, the visible surface if it is not their boundary, the repair of the input
+/// and what is painted in the file.
 fn mesh(
     request: &BakeRequest,
     shared: &BakeShared,
-) -> Result<(TetMesh, Option<Surface>, Option<Repair>), BakeBodyError> {
+) -> Result<(TetMesh, Option<Surface>, Option<Repair>, Option<Paint>), BakeBodyError> {
     let options = StuffOptions::with_target(request.tets);
     let mut progress = |share: f32| shared.report(0, f64::from(share));
+    let mut paint = None;
     let ((tets, repair), own) = match &request.shape {
         BakeShape::Distance(distance) => {
             ((stuff(&**distance, &options, &mut progress)?, None), Own("a distance", None))
@@ -153,7 +157,13 @@ fn mesh(
             return Err(BakeBodyError::UnusableMesh { expected: "a mesh that is loaded" });
         }
         BakeShape::Input(input) => fill(Input::clone(input), &options, &mut progress)?,
-        BakeShape::File(path) => fill(read(path)?, &options, &mut progress)?,
+        BakeShape::File(path) => {
+            let (input, painted) = Paint::read(path)?;
+            // Before the long work.
+            painted.as_ref().map_or(Ok(()), Paint::check)?;
+            paint = painted;
+            fill(input, &options, &mut progress)?
+        }
     };
     let skin = match &request.skin {
         BakeSkin::Tetrahedra => None,
@@ -161,11 +171,7 @@ fn mesh(
         BakeSkin::File(path) => Some(io::read_surface(path)?),
         BakeSkin::Surface(surface) => Some(Surface::clone(surface)),
     };
-    Ok((tets, skin, repair))
-}
-
-fn read(path: &Path) -> Result<Input, BakeBodyError> {
-    Ok(io::read(path)?)
+    Ok((tets, skin, repair, paint))
 }
 
 /// The name of a shape's kind, and its surface if the shape is a surface.

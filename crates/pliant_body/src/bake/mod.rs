@@ -6,6 +6,7 @@ mod job;
 mod node;
 mod process;
 mod request;
+mod settings;
 
 use std::collections::VecDeque;
 
@@ -15,8 +16,9 @@ use pliant_bake::BakeCache;
 pub use extras::BakeExtrasError;
 pub use from_mesh::{ATTRIBUTE_ANCHOR, ATTRIBUTE_DENSITY, ATTRIBUTE_STIFFNESS};
 pub use node::BakeNode;
-pub use process::{BakeProcessor, BakeSettings};
+pub use process::BakeProcessor;
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
+pub use settings::BakeSettings;
 
 use crate::{ModalAsset, ModalBody};
 use from_mesh::resolve;
@@ -51,6 +53,7 @@ impl Plugin for BakePlugin {
         app.register_asset_processor(BakeProcessor)
             .register_type::<BakeRequest>()
             .register_type::<BakeNode>()
+            .register_type::<BakeSettings>()
             .register_type::<BakeFailed>()
             .register_type::<BakeProgress>()
             .register_type::<BakeStage>()

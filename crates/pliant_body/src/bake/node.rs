@@ -1,10 +1,9 @@
 //! Bodies from the nodes of a glTF scene.
 
 use bevy::prelude::*;
-use pliant_bake::BakeConfig;
 
 use super::{
-    BakeBodyError, BakeFailed, BakeProgress, BakeRequest,
+    BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeSettings,
     from_mesh::{loaded, triangles},
 };
 use crate::ModalBody;
@@ -27,21 +26,17 @@ use crate::ModalBody;
 ///     }
 /// }
 /// ```
-#[derive(Component, Reflect, Debug, Clone, PartialEq)]
-#[reflect(opaque)]
+///
+/// What [`BakeSettings`] lack, such as a limit of the sites of a very large surface, a
+/// [`BakeRequest`] has.
+///
+/// Its settings are plain data, so that an inspector shows them, and a level editor such as
+/// Skein for Blender puts the component on a node: `pliant_body::bake::node::BakeNode`.
+#[derive(Component, Reflect, Debug, Default, Clone, PartialEq)]
 #[reflect(Component, Debug, Default, Clone, PartialEq)]
 pub struct BakeNode {
-    /// Approximate number of tetrahedra. Default: 10,000.
-    pub tets: usize,
-    /// The material, the number of modes and the anchors, in the space of the mesh.
-    pub config: BakeConfig,
-}
-
-impl Default for BakeNode {
-    fn default() -> Self {
-        let BakeRequest { tets, config, .. } = BakeRequest::meshes([]);
-        Self { tets, config }
-    }
+    /// How the body is made. Anchors and regions are in the space of the mesh.
+    pub settings: BakeSettings,
 }
 
 pub(super) fn bake_nodes(
@@ -58,6 +53,7 @@ pub(super) fn bake_nodes(
             .filter_map(|&child| drawn.get(child).ok())
             .map(|(child, mesh)| (child, mesh.0.clone()))
             .unzip();
+        let config = node.settings.config();
         let counts = loaded(&handles, meshes.as_deref(), server.as_deref()).and_then(|meshes| {
             let Some(meshes) = meshes else { return Ok(None) };
             if meshes.is_empty() {
@@ -66,11 +62,11 @@ pub(super) fn bake_nodes(
             let count = |mesh: &&Mesh| Ok(triangles(mesh)?.triangles.len() as u32);
             meshes.iter().map(count).collect::<Result<Vec<u32>, BakeBodyError>>().map(Some)
         });
-        match counts {
-            Ok(None) => {}
-            Ok(Some(counts)) => {
+        match counts.and_then(|counts| Ok((counts, config?))) {
+            Ok((None, _)) => {}
+            Ok((Some(counts), config)) => {
                 give_parts(&mut commands, &parts, &counts);
-                let BakeNode { tets, config } = node.clone();
+                let tets = node.settings.tets;
                 let request = BakeRequest { tets, config, ..BakeRequest::meshes(handles) };
                 commands
                     .entity(entity)

@@ -3,7 +3,7 @@
 use std::{fmt, path::PathBuf, sync::Arc};
 
 use bevy::prelude::*;
-use pliant_bake::{BakeConfig, BakeError};
+use pliant_bake::{AnchorSyntax, BakeConfig, BakeError, MaterialSyntax, RegionSyntax};
 use pliant_mesh::{MeshError, Repair, Surface, TetMesh, io::Input, sdf::SignedDistance};
 use thiserror::Error;
 
@@ -71,7 +71,9 @@ impl BakeRequest {
 pub enum BakeShape {
     /// A file on disk: a surface (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a scene of rounded
     /// parts (`.ron`) or tetrahedra (`.msh`, `.vtk`, `.mesh`, `.veg`). A defective surface is
-    /// repaired. A relative path starts in the working directory, not in the asset folder.
+    /// repaired. A relative path starts in the working directory, not in the asset folder. What is
+    /// painted in a glTF file ([`Paint::ATTRIBUTES`](pliant_bake::Paint::ATTRIBUTES)) becomes the
+    /// request's [`BakeConfig::paint`], unless that is given.
     File(PathBuf),
     /// Meshes of the engine, such as `assets.load("bird.glb#Mesh0/Primitive0")`, in their own
     /// space. Together they enclose the body.
@@ -188,6 +190,15 @@ pub enum BakeBodyError {
     /// The bake was refused.
     #[error("the body could not be baked: {0}")]
     Bake(#[from] BakeError),
+    /// An anchor of [`BakeSettings`](crate::BakeSettings) cannot be read.
+    #[error("{0}")]
+    Anchor(#[from] AnchorSyntax),
+    /// A region of [`BakeSettings`](crate::BakeSettings) cannot be read.
+    #[error("{0}")]
+    Region(#[from] RegionSyntax),
+    /// There is no such material.
+    #[error("{0}")]
+    Material(#[from] MaterialSyntax),
     /// The skin is [`BakeSkin::Shape`], but the shape is not a surface.
     #[error("the body cannot wear its shape as a skin: expected a surface, got {got}")]
     NoSurface {

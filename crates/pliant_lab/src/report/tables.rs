@@ -205,7 +205,7 @@ fn body_of(
 ) -> Result<(usize, Arc<ModalModel>, f64), LabError> {
     let mesh = match source {
         None => shapes::bar([20, 3, 3], [1.0, 0.15, 0.15])?,
-        Some(path) => fill(path, Some(tets), progress)?.0,
+        Some(path) => fill(path, Some(tets), progress)?.mesh,
     };
     let [low, high] = mesh.bounds();
     let held = if source.is_none() { anchor(0, 1e-9) } else { anchor(1, low[1] + 0.06 * (high[1] - low[1])) };
@@ -302,7 +302,7 @@ impl PulledBody {
     ) -> Result<Self, LabError> {
         let bunny = models.join("bunny.obj");
         let (path, name) = if bunny.is_file() { (bunny, "bunny") } else { (own.to_path_buf(), "own body") };
-        let (mesh, _) = fill(&path, Some(tets), progress)?;
+        let mesh = fill(&path, Some(tets), progress)?.mesh;
         let [low, high] = mesh.bounds();
         let setting = BakeConfig {
             sites: None,

@@ -114,8 +114,13 @@ struct Buffer {
     uri: Option<String>,
 }
 
-/// Parses a document. `folder` contains the files that the document names.
-pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
+/// Parses a document. `folder` contains the files that the document names. Also returns the numbers
+/// that the vertices have of each of the `attributes`, see [`super::read_painted`].
+pub(super) fn parse(
+    bytes: &[u8],
+    folder: &Path,
+    attributes: &[&str],
+) -> Result<(Surface, Vec<Vec<f32>>), MeshError> {
     let (json, blob) = chunks(bytes)?;
     let document: Document = serde_json::from_slice(json)
         .map_err(|e| parse_error("glTF", Place::Line(e.line()), "a glTF 2.0 document", e.to_string()))?;
@@ -134,6 +139,7 @@ pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
         buffers,
         surface: Surface::default(),
         uvs: Some(Vec::new()),
+        painted: attributes.iter().map(|&name| (name, Vec::new())).collect(),
         nodes: 0,
         most,
     };
@@ -145,7 +151,14 @@ pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
         reader.node(node, Matrix4::identity(), 0)?;
     }
     reader.surface.uvs = reader.uvs.filter(|uvs| !uvs.is_empty());
-    Ok(reader.surface)
+    let count = reader.surface.positions.len();
+    let whole = |(_, mut values): (_, Vec<f32>)| {
+        if !values.is_empty() {
+            values.resize(count, f32::NAN);
+        }
+        values
+    };
+    Ok((reader.surface, reader.painted.into_iter().map(whole).collect()))
 }
 
 /// Returns the document and the binary data that may follow it in a `.glb`.
@@ -182,6 +195,8 @@ struct GltfReader<'a> {
     surface: Surface,
     /// Texture coordinates. They are dropped when one mesh has none.
     uvs: Option<Vec<[f32; 2]>>,
+    /// The wanted attributes, and their numbers up to the last vertex that has one.
+    painted: Vec<(&'a str, Vec<f32>)>,
     /// Number of nodes and primitives so far.
     nodes: usize,
     /// Largest number of placed vertices, and of placed triangles.
@@ -229,6 +244,17 @@ impl GltfReader<'_> {
         let uvs = primitive.attributes.get("TEXCOORD_0").and_then(|&uvs| self.floats::<2>(uvs, "VEC2").ok());
         let uvs: Option<Vec<_>> = uvs.filter(|uvs| uvs.len() == vertices).map(Iterator::collect);
         let positions: Vec<[f32; 3]> = positions.collect();
+        // What is painted and cannot be read would be missed without a word.
+        let scalars = |name: &str| -> Result<Option<Vec<f32>>, MeshError> {
+            let Some(&accessor) = primitive.attributes.get(name) else { return Ok(None) };
+            let unread = |found: String| wrong(format!("a float of each vertex as {name}"), found);
+            let values = self.floats::<1>(accessor, "SCALAR").map_err(|error| unread(error.to_string()))?;
+            if values.len() != vertices {
+                return Err(unread(format!("{} for {vertices} vertices", values.len())));
+            }
+            Ok(Some(values.map(|[value]| value).collect()))
+        };
+        let painted = self.painted.iter().map(|(name, _)| scalars(name)).collect::<Result<Vec<_>, _>>()?;
         let indices: Vec<u32> = indices.map_or_else(|| (0..vertices as u32).collect(), Iterator::collect);
         if let Some(&index) = indices.iter().find(|&&i| i as usize >= positions.len()) {
             let (index, count) = (u64::from(index), positions.len());
@@ -246,6 +272,12 @@ impl GltfReader<'_> {
         let first = u32::try_from(self.surface.positions.len() + positions.len())
             .map_err(|_| wrong("at most 4 billion vertices", "more"))?
             - positions.len() as u32;
+        for ((_, all), values) in self.painted.iter_mut().zip(painted) {
+            if let Some(values) = values {
+                all.resize(first as usize, f32::NAN);
+                all.extend(values);
+            }
+        }
         let mirrors = place.fixed_view::<3, 3>(0, 0).determinant() < 0.0;
         self.surface.positions.extend(positions.iter().map(|p| {
             let p = Point3::from(p.map(f64::from));
@@ -417,6 +449,10 @@ fn wrong(expected: impl Into<String>, found: impl Into<String>) -> MeshError {
 pub(super) mod tests {
     use super::*;
 
+    fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
+        Ok(super::parse(bytes, folder, &[])?.0)
+    }
+
     /// Makes a document with one triangle: 36 bytes of positions and 6 bytes of indices.
     ///
     /// A node mirrors the triangle, and the first node moves by 5.
@@ -437,6 +473,44 @@ pub(super) mod tests {
     pub(in super::super) const DATA: &str =
         "data:application/octet-stream;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAAAAABAAIA";
     pub(in super::super) const CHILDREN: &str = r#","children":[1]"#;
+
+    /// Two triangles, of which the second has numbers.
+    fn painted(attributes: &str, kind: u32) -> String {
+        format!(
+            r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0}}],
+            "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}},
+                {{"attributes":{{"POSITION":0{attributes}}},"indices":1}}]}}],
+            "accessors":[
+                {{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3"}},
+                {{"bufferView":1,"componentType":5123,"count":3,"type":"SCALAR"}},
+                {{"bufferView":0,"componentType":{kind},"count":3,"type":"SCALAR"}}],
+            "bufferViews":[{{"buffer":0,"byteLength":36}},{{"buffer":0,"byteOffset":36,"byteLength":6}}],
+            "buffers":[{{"byteLength":42,"uri":"{DATA}"}}]}}"#
+        )
+    }
+
+    #[test]
+    fn numbers_at_vertices_are_read_where_they_are_and_others_have_none() {
+        let read = |attributes, kind| {
+            let names = ["_STIFFNESS", "_ANCHOR"];
+            super::parse(painted(attributes, kind).as_bytes(), Path::new("."), &names).unwrap()
+        };
+        let (surface, values) = read(r#","_STIFFNESS":2"#, FLOAT);
+        assert_eq!((surface.positions.len(), values.len()), (6, 2));
+        // The first floats of the data: (0, 0, 0).
+        assert!(values[0][..3].iter().all(|x| x.is_nan()) && values[0][3..] == [0.0; 3], "{values:?}");
+        assert!(values[1].is_empty());
+        let (surface, values) = read("", FLOAT);
+        assert_eq!((surface.positions.len(), values), (6, vec![Vec::new(); 2]));
+        // Those of another type, and those that are not there, would be missed without a word.
+        for (attributes, kind) in [(r#","_STIFFNESS":2"#, UNSIGNED_INT), (r#","_STIFFNESS":9"#, FLOAT)] {
+            let text = painted(attributes, kind);
+            let error =
+                super::parse(text.as_bytes(), Path::new("."), &["_STIFFNESS"]).unwrap_err().to_string();
+            assert!(error.contains("_STIFFNESS"), "{error}");
+            assert!(parse(text.as_bytes(), Path::new(".")).is_ok(), "nobody has asked for it");
+        }
+    }
 
     #[test]
     fn nodes_place_their_meshes_and_mirrors_keep_the_outside_outside() {

@@ -113,35 +113,57 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
 /// error in the file.
 pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
     let path = path.as_ref();
-    surface_of(path, || bytes(path))
+    Ok(surface_of(path, &[], || bytes(path))?.0)
 }
 
-/// Reads a triangle surface from the bytes of a file, as [`read_surface`] does. The extension of
-/// `path` determines the format, and the other files of a `.gltf` are looked for beside it.
+/// Reads a surface as [`read_surface`] does, with the numbers that its vertices have of each of the
+/// `attributes`: accessors of single floats of a glTF file, such as `_STIFFNESS`.
+///
+/// A list is as long as the vertices, with NaN where a part of the surface lacks the attribute, or
+/// empty where all lack it. Files of other formats have none.
 ///
 /// # Errors
 /// Returns the errors of [`read_surface`].
-pub fn parse_surface(path: impl AsRef<Path>, bytes: &[u8]) -> Result<Surface, MeshError> {
-    surface_of(path.as_ref(), || Ok(bytes))
+pub fn read_painted(
+    path: impl AsRef<Path>,
+    attributes: &[&str],
+) -> Result<(Surface, Vec<Vec<f32>>), MeshError> {
+    let path = path.as_ref();
+    surface_of(path, attributes, || bytes(path))
+}
+
+/// Reads a surface from the bytes of a file, as [`read_painted`] does. The extension of `path`
+/// determines the format, and the other files of a `.gltf` are looked for beside it.
+///
+/// # Errors
+/// Returns the errors of [`read_surface`].
+pub fn parse_painted(
+    path: impl AsRef<Path>,
+    bytes: &[u8],
+    attributes: &[&str],
+) -> Result<(Surface, Vec<Vec<f32>>), MeshError> {
+    surface_of(path.as_ref(), attributes, || Ok(bytes))
 }
 
 fn surface_of<B: AsRef<[u8]>>(
     path: &Path,
+    attributes: &[&str],
     bytes: impl FnOnce() -> Result<B, MeshError>,
-) -> Result<Surface, MeshError> {
+) -> Result<(Surface, Vec<Vec<f32>>), MeshError> {
     let folder = path.parent().unwrap_or(Path::new(""));
-    let parse: &dyn Fn(&[u8]) -> Result<Surface, MeshError> = match extension(path).as_str() {
-        "obj" => &obj::parse,
-        "stl" => &stl::parse,
-        "ply" => &ply::parse,
-        "gltf" | "glb" => &|bytes| gltf::parse(bytes, folder),
+    let bare = |surface| (surface, vec![Vec::new(); attributes.len()]);
+    let parse: &dyn Fn(&[u8]) -> Result<_, MeshError> = match extension(path).as_str() {
+        "obj" => &|bytes| obj::parse(bytes).map(bare),
+        "stl" => &|bytes| stl::parse(bytes).map(bare),
+        "ply" => &|bytes| ply::parse(bytes).map(bare),
+        "gltf" | "glb" => &|bytes| gltf::parse(bytes, folder, attributes),
         _ => return Err(unknown(path, SURFACES)),
     };
     let bytes = bytes()?;
     in_file(path, || {
-        let surface = parse(bytes.as_ref())?;
-        surface.check()?;
-        Ok(surface)
+        let read = parse(bytes.as_ref())?;
+        read.0.check()?;
+        Ok(read)
     })
 }
 
@@ -500,8 +522,9 @@ mod tests {
 
         fn any_reader(bytes: &[u8]) {
             let _ = Scene::from_ron(&String::from_utf8_lossy(bytes));
-            for parse in [obj::parse, ply::parse, stl::parse, |b: &[u8]| gltf::parse(b, Path::new("nowhere"))]
-            {
+            for parse in [obj::parse, ply::parse, stl::parse, |b: &[u8]| {
+                gltf::parse(b, Path::new("nowhere"), &["_STIFFNESS"]).map(|(surface, _)| surface)
+            }] {
                 let _ = parse(bytes).map(|s| s.check().and_then(|()| s.closed()));
                 let _ = parse(bytes).map(|s| s.repaired());
             }
