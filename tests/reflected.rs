@@ -22,10 +22,11 @@ use pliant::{
 const CRATES: [&str; 4] = ["pliant_body", "pliant_contact", "pliant_net", "pliant_haptics"];
 
 /// The public components and resources that are not registered, and why.
-const WITHOUT: [(&str, &str); 15] = [
+const WITHOUT: [(&str, &str); 16] = [
     ("BakeRequest", "may hold code of the game, which cannot be saved"),
     ("Bakery", "bakes that are running"),
     ("BodyState", "a solver that runs; a saved world has SavedState in its place"),
+    ("BodyStepTimes", "what the newest tick took"),
     ("CarrierPort", "open connections"),
     ("DrawnSurface", "what is on the graphics card"),
     ("FixedObstacles", "what a session asks when it begins; the next one asks anew"),

@@ -109,7 +109,7 @@ pub use probe::{ProbeShape, ProbeState, TouchProbe, Touching};
 pub use ride_on::RideOn;
 pub use riding::RidingPlugin;
 pub use saved::SavedState;
-pub use step::{PliantTick, RigidBodies};
+pub use step::{BodyStepTimes, PliantTick, RigidBodies};
 pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
 pub use surroundings::FixedObstacles;
 pub use visual::{Pose, VisualState};

@@ -1,5 +1,7 @@
 //! Bodies that touch each other.
 
+use std::time::Duration;
+
 use nalgebra::Vector3;
 
 use crate::{
@@ -29,6 +31,9 @@ pub struct Together<'a> {
     pub report: StepReport,
     /// Set by a step that fails: why.
     pub error: Option<StepError>,
+    /// Time that the step of a lone body has taken, if whoever calls [`Islands::step_by`] measures
+    /// it there. Default: zero.
+    pub took: Duration,
     /// Whether the body is stepped now, and near no other body or probe.
     lone: bool,
 }
@@ -44,8 +49,15 @@ impl<'a> Together<'a> {
             island: 0,
             report: StepReport::default(),
             error: None,
+            took: Duration::ZERO,
             lone: false,
         }
+    }
+
+    /// Whether the body was stepped alone: near no other body, no probe and no rigid body that
+    /// gives way.
+    pub fn is_lone(&self) -> bool {
+        self.lone
     }
 }
 

@@ -30,6 +30,8 @@ pub struct BodyView {
     pub local: bool,
     /// Whether the body rests: it is neither stepped nor sent nor drawn again.
     pub resting: bool,
+    /// Mean time of a step of this body, us. `None` if this app does not step it, or if it rests.
+    pub step_us: Option<f64>,
     /// Kinetic and elastic energy, J.
     pub energy: f64,
     /// Energy over the last seconds, J.
@@ -118,7 +120,10 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
         })
         .on_hover_text("Multiplies the damping that was baked.");
         let reduced = body.settings.elasticity == Elasticity::Reduced && !body.material.is_empty();
-        if !body.material.is_empty() {
+        if body.material.is_empty() {
+            ui.weak("linear elasticity")
+                .on_hover_text("The model was baked without a material for large strains.");
+        } else {
             let mut on = reduced;
             ui.checkbox(&mut on, format!("reduced elasticity, {}", body.material))
                 .on_hover_text("Forces of large strains; off is linear, which costs a hundredth.");
@@ -131,6 +136,10 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
     });
     ui.horizontal(|ui| {
         ui.label(format!("{} Hz \u{b7} {} J", short(body.lowest_hz), short(body.energy)));
+        if let Some(step) = body.step_us {
+            ui.label(format!("\u{b7} {} \u{b5}s a step", short(step)))
+                .on_hover_text("What its elasticity, its hands and its contacts take.");
+        }
         if body.resting && ui.button("Wake").clicked() {
             body.wake = true;
         }

@@ -55,6 +55,18 @@ fn time_is_paused_run_stepped_and_slowed() {
 }
 
 #[test]
+fn a_body_tells_its_elasticity_and_what_a_step_takes() {
+    let views = |material: &str, step_us| vec![BodyView { material: material.into(), step_us, ..body() }];
+    let shown = |views| Harness::new_ui_state(|ui, views: &mut Vec<BodyView>| bodies::show(ui, views), views);
+    let linear = shown(views("", None));
+    assert!(linear.query_by_label("linear elasticity").is_some());
+    assert!(linear.query_by_label_contains("a step").is_none(), "nobody steps it here");
+    let reduced = shown(views("neo-hookean", Some(52.4)));
+    assert!(reduced.query_by_label_contains("reduced elasticity, neo-hookean").is_some());
+    assert!(reduced.query_by_label_contains("52.4 \u{b5}s a step").is_some());
+}
+
+#[test]
 fn a_body_is_given_fewer_modes_more_damping_and_no_warp() {
     let mut harness =
         Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);

@@ -24,7 +24,7 @@ const MAX_TABS: usize = 12;
 
 /// Areas about how the program runs, as opposed to bodies, hands and the network. They share one
 /// place, in tabs.
-const HOUSEKEEPING: [&str; 3] = ["time", "frame", "bodies"];
+const HOUSEKEEPING: [&str; 4] = ["time", "step", "frame", "bodies"];
 
 /// Areas whose plots come first. Areas that are named neither here nor in `LAST`, such as a game's
 /// own areas, come between them.
@@ -116,7 +116,7 @@ impl Plots {
                 Some(place) => place,
                 None => LAST.iter().position(|last| *last == cell).map_or(FIRST.len(), |p| 10 + p),
             };
-            let front = HOUSEKEEPING.iter().position(|other| other == area).unwrap_or(0) * UNITS.len();
+            let front = HOUSEKEEPING.iter().position(|other| other == area).unwrap_or(0) * (UNITS.len() + 1);
             let front = front + UNITS.iter().position(|other| other == unit).unwrap_or(UNITS.len());
             let plot = Plot { title, area: area.clone(), contents, lines: paths.len() };
             cells.entry((place, cell)).or_default().push((front, plot));

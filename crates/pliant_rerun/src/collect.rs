@@ -13,7 +13,7 @@ use bevy::{
     prelude::*,
 };
 use crossbeam_channel::Receiver;
-use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, VisualState};
+use pliant_body::{BodyRefused, BodyState, BodyStepTimes, Driven, Grab, GrabForce, PliantTick, VisualState};
 
 use crate::{
     RerunRecording, RerunScalars, RerunStats, RerunStyle,
@@ -114,10 +114,6 @@ pub(crate) struct WantedData {
     /// Whether the energies of the modes are drawn as bars.
     bars: bool,
     /// Whether states that are logged as text are checked for changes, a few times per second.
-    #[cfg_attr(
-        not(any(feature = "haptics", feature = "net")),
-        expect(dead_code, reason = "only these log texts")
-    )]
     texts: bool,
     /// Length of a tick, s.
     tick: f64,
@@ -166,7 +162,6 @@ impl Collector {
     }
 
     /// The name under which a body is recorded. `None` before its first frame.
-    #[cfg(feature = "contact")]
     pub fn path_of(&self, body: Entity) -> Option<&Arc<str>> {
         self.bodies.get(&body).map(|followed| &followed.drawn.path)
     }
@@ -176,7 +171,6 @@ pub(crate) fn somebody_listens(collector: Res<Collector>, recording: Res<RerunRe
     recording.on && collector.workers.iter().any(Worker::listens)
 }
 
-#[cfg(any(feature = "contact", feature = "haptics", feature = "net"))]
 pub(crate) fn wants_metrics(wanted: Res<WantedData>) -> bool {
     wanted.metrics
 }
@@ -186,7 +180,6 @@ pub(crate) fn wants_hands(wanted: Res<WantedData>) -> bool {
     wanted.hands
 }
 
-#[cfg(any(feature = "haptics", feature = "net"))]
 pub(crate) fn wants_text(wanted: Res<WantedData>) -> bool {
     wanted.texts
 }
@@ -212,6 +205,7 @@ pub(crate) fn decide(
     mut wanted: ResMut<WantedData>,
     mut own: ResMut<RerunScalars>,
     mut stats: ResMut<RerunStats>,
+    mut step_times: ResMut<BodyStepTimes>,
     recording: Res<RerunRecording>,
     time: Res<Time>,
 ) {
@@ -228,6 +222,9 @@ pub(crate) fn decide(
         stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
         *wanted = WantedData::default();
         return;
+    }
+    if recording.metrics_hz > 0.0 {
+        step_times.ask();
     }
     let now = time.elapsed_secs_f64();
     *wanted = WantedData {

@@ -19,12 +19,13 @@
 //! | `reaction/NAME` | magnitude of the reaction, N, in the color of the hand's user |
 //! | `displacement/NAME` | largest displacement of the surface, m |
 //! | `energy/NAME` | kinetic and elastic energy of all modes together, J |
+//! | `step/NAME` | time of a step of the body, us; bodies that are near other bodies, tools or rigid bodies share theirs |
 //! | `stress/NAME` | largest von Mises stress in the skin, Pa, if the color shows the stress |
 //! | `modes/NAME` | energy of each mode, J, as bars |
 //! | `spectrum/NAME` | amplitude of the body's most compliant point at each frequency, m over Hz, in the last 256 ticks |
 //! | `AREA/NAME` | every Bevy diagnostic under `pliant/AREA/`, such as those of the network; those of the body crate are `time/step` (ms per tick), `frame/deform` (ms per frame) and `bodies/awake` |
 //! | any other | values set in [`RerunScalars`] |
-//! | `log` | refused inputs, lines written with [`RerunScalars::log`], and the app's log lines, with [`log_layer`] |
+//! | `log` | the elasticity of every body, refused inputs, lines written with [`RerunScalars::log`], and the app's log lines, with [`log_layer`] |
 //!
 //! With the feature `contact`, `world/contacts` holds an arrow for the force of each place where a
 //! body touches. It ends there, and is green where it holds and red where it slides. An arrow of
@@ -57,6 +58,7 @@ mod collect;
 mod columns;
 #[cfg(feature = "contact")]
 mod contact;
+mod cost;
 mod frame;
 #[cfg(feature = "haptics")]
 mod haptics;

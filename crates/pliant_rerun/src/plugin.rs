@@ -6,7 +6,7 @@ use bevy::{
     ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
     prelude::*,
 };
-use pliant_body::PliantSystems;
+use pliant_body::{BodyStepTimes, PliantSystems};
 use thiserror::Error;
 
 use crate::{
@@ -84,6 +84,7 @@ impl RerunPlugin {
                 ("energy".into(), "Energy".into()),
                 ("time".into(), "Time a tick".into()),
                 ("frame".into(), "Time a frame".into()),
+                ("step".into(), "Time of a step".into()),
                 ("bodies".into(), "Bodies that are awake".into()),
             ],
         }
@@ -320,6 +321,7 @@ impl Plugin for RerunPlugin {
             .register_type::<RerunRecording>()
             .init_resource::<collect::Hands>()
             .init_resource::<collect::WantedData>()
+            .init_resource::<BodyStepTimes>()
             .add_observer(collect::note_refusal)
             .add_systems(
                 self.schedule,
@@ -327,6 +329,11 @@ impl Plugin for RerunPlugin {
                     collect::decide.in_set(Deciding).run_if(collect::somebody_listens),
                     collect::collect.in_set(RerunSystems).run_if(collect::somebody_listens),
                     collect::forget.in_set(RerunSystems).run_if(not(collect::somebody_listens)),
+                    crate::cost::log_elasticity
+                        .in_set(Gathering)
+                        .run_if(collect::wants_text)
+                        .run_if(collect::somebody_listens),
+                    crate::cost::plot_step_times.in_set(Gathering).run_if(collect::wants_metrics),
                 ),
             )
             .configure_sets(

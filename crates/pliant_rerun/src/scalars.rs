@@ -68,7 +68,6 @@ impl RerunScalars {
         self.line(true, text.into());
     }
 
-    #[cfg(any(feature = "contact", feature = "haptics"))]
     pub(crate) fn measured(&mut self, metric: &Arc<Metric>, value: f64) {
         if self.measured.len() < Self::LIMIT {
             self.measured.push((metric.clone(), value));

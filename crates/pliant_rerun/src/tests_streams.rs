@@ -244,21 +244,34 @@ fn a_stream_with_a_rate_of_zero_is_not_gathered_and_not_in_the_file() {
         let paths = messages.iter().filter_map(of);
         paths.filter(|path| path != "/world" && !path.starts_with("/__properties")).collect()
     };
-    let nothing = BTreeSet::new();
+    // Of each body the log has its elasticity.
+    let log = || "/log".to_owned();
+    let nothing = BTreeSet::from([log()]);
     let shapes = |messages: &[LogMsg]| rows(messages, "/world/square", "vertex_positions") as u64;
     let (none, empty) = collected(off, "off", RerunStyle::Surface);
     assert_eq!((none.collected, none.shapes), (200, 0));
-    assert_eq!(told(&empty), nothing, "nothing but the world's axes and the layout");
+    assert_eq!(told(&empty), nothing, "nothing but the log, the world's axes and the layout");
     let (all, full) = collected(RerunRecording::default(), "all", RerunStyle::Surface);
     assert!(all.shapes >= 195, "{all:?}");
     assert!((95..=101).contains(&shapes(&full)), "20 Hz of 40: {}", shapes(&full));
     assert_eq!(numbers(&full, "/error/now", "scalars").len(), 200);
-    let streams =
-        ["/displacement/square", "/energy/square", "/modes/square", "/reaction/hand", "/world/hands/targets"];
+    let streams = [
+        "/displacement/square",
+        "/energy/square",
+        "/modes/square",
+        "/reaction/hand",
+        "/step/square",
+        "/world/hands/targets",
+    ];
     assert!(streams.iter().all(|path| told(&full).contains(*path)), "{:?}", told(&full));
+    let steps = numbers(&full, "/step/square", "scalars");
+    assert!(steps.len() >= 195 && steps.iter().all(|us| *us > 0.0 && *us < 1e6), "{steps:?}");
     let (drawn, file) = collected(RerunRecording { shapes_hz: 10.0, ..off }, "drawn", RerunStyle::Surface);
     assert!((48..=51).contains(&drawn.shapes), "10 Hz of 40: {drawn:?}");
-    assert_eq!((shapes(&file), told(&file)), (drawn.shapes, BTreeSet::from(["/world/square".to_owned()])));
+    assert_eq!(
+        (shapes(&file), told(&file)),
+        (drawn.shapes, BTreeSet::from(["/world/square".to_owned(), log()]))
+    );
     let (hidden, file) = collected(RerunRecording { shapes_hz: 10.0, ..off }, "hidden", RerunStyle::Hidden);
     assert_eq!((hidden.shapes, told(&file)), (0, nothing));
 }

@@ -2,7 +2,8 @@ use bevy::{asset::LoadState, math::DVec3, prelude::*};
 
 use super::{app, frames_of, model, refusals, spawn, spawn_with, state, steps, tick};
 use crate::{
-    Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems, Pose, VisualState,
+    BodyStepTimes, Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems, Pose,
+    VisualState,
 };
 
 #[test]
@@ -351,6 +352,28 @@ fn a_modal_file_loads_and_one_that_is_cut_altered_or_of_another_version_says_why
         "the others are no bodies"
     );
     std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn the_step_of_each_body_is_timed_where_somebody_asks() {
+    let mut app = app();
+    let moving = spawn_with(&mut app, model::bar(), |body| body.rest_speed = 0.0, ());
+    let resting = spawn(&mut app, model::bar(), ());
+    steps(&mut app, 30);
+    assert!(app.world().get_resource::<BodyStepTimes>().is_none(), "nobody has asked");
+    app.init_resource::<BodyStepTimes>();
+    steps(&mut app, 2);
+    assert_eq!(app.world().resource::<BodyStepTimes>().get(moving), None, "nobody has asked");
+    app.world_mut().resource_mut::<BodyStepTimes>().ask();
+    for _ in 0..BodyStepTimes::TICKS {
+        steps(&mut app, 1);
+        let times = app.world().resource::<BodyStepTimes>();
+        let took = times.get(moving).unwrap();
+        assert!(!took.is_zero() && took.as_secs() < 60, "{took:?}");
+        assert_eq!(times.get(resting), None, "it was not stepped");
+    }
+    steps(&mut app, 1);
+    assert_eq!(app.world().resource::<BodyStepTimes>().get(moving), None, "nobody asks any more");
 }
 
 #[test]

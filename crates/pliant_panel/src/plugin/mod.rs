@@ -13,6 +13,7 @@ mod session;
 
 use bevy::prelude::*;
 use bevy_egui::{EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::EguiWantsInput};
+use pliant_body::BodyStepTimes;
 
 use crate::recording::{self, RecordingView};
 
@@ -85,6 +86,7 @@ impl Plugin for PanelPlugin {
         app.register_type::<Panel>()
             .insert_resource(Panel { open: self.open, key: self.key, only: self.only, ..default() })
             .init_resource::<scene::SceneHistories>()
+            .init_resource::<BodyStepTimes>()
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
             .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open));
         #[cfg(feature = "haptics")]

@@ -9,8 +9,8 @@ use bevy::{
 };
 use bevy_egui::egui::Ui;
 use pliant_body::{
-    BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME, SingleSteps,
-    VisualState,
+    BodyState, BodyStepTimes, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME,
+    SingleSteps, VisualState,
 };
 
 use crate::{
@@ -18,6 +18,9 @@ use crate::{
     bodies::{self, BodyView, HandView},
     time::{self, TimeView},
 };
+
+/// Share of the newest time of a step in the mean that is shown, so that it can be read.
+const STEP_SHARE: f64 = 0.05;
 
 /// Data of the scene that the panel keeps between frames, for its plots.
 #[derive(Resource, Default)]
@@ -28,6 +31,10 @@ pub(super) struct SceneHistories {
     contacts: EntityHashMap<Trace>,
     /// Whether a body's header is closed.
     folded: EntityHashMap<bool>,
+    /// Mean time of a step of each body over the last frames with a tick, us.
+    step_us: EntityHashMap<f64>,
+    /// The tick that was shown last.
+    tick: u64,
     step_ms: Trace,
     deform_ms: Trace,
 }
@@ -51,6 +58,7 @@ pub(super) struct SceneParam<'w, 's> {
     fixed_time: Option<Res<'w, Time<Fixed>>>,
     real_time: Res<'w, Time<Real>>,
     tick: Res<'w, PliantTick>,
+    times: ResMut<'w, BodyStepTimes>,
     diagnostics: Option<Res<'w, DiagnosticsStore>>,
     bodies: Query<
         'w,
@@ -114,6 +122,9 @@ impl SceneParam<'_, '_> {
         #[cfg(feature = "contact")]
         let mut contacts = std::mem::take(&mut self.histories.contacts);
         let folded = std::mem::take(&mut self.histories.folded);
+        let means = std::mem::take(&mut self.histories.step_us);
+        let stepped = std::mem::replace(&mut self.histories.tick, self.tick.0) != self.tick.0;
+        self.times.ask();
         let mut found: Vec<_> = self.bodies.iter_mut().collect();
         found.sort_by_key(|(name, ..)| name.entity);
         let many = found.len() > 3;
@@ -137,6 +148,14 @@ impl SceneParam<'_, '_> {
                 let omega = state.body().omega().first();
                 view.lowest_hz = omega.map_or(0.0, |omega| omega / std::f64::consts::TAU);
                 view.settings = body.settings;
+                view.step_us = self.times.get(name.entity).map(|time| {
+                    let newest = time.as_secs_f64() * 1e6;
+                    match means.get(&name.entity) {
+                        Some(mean) if stepped => mean + STEP_SHARE * (newest - mean),
+                        Some(mean) => *mean,
+                        None => newest,
+                    }
+                });
                 view.energy = energy_of(state, driven, *shown);
                 view.energies = energies.remove(&name.entity).unwrap_or_default();
                 view.energies.push(now, view.energy);
@@ -191,6 +210,7 @@ impl SceneParam<'_, '_> {
                     self.commands.entity(grab).despawn();
                 }
             }
+            histories.step_us.extend(view.step_us.map(|mean| (name.entity, mean)));
             histories.energies.insert(name.entity, view.energies);
             #[cfg(feature = "contact")]
             histories.contacts.extend(view.contact.map(|contact| (name.entity, contact.forces)));
