@@ -160,7 +160,7 @@ fn take_hold(
                 let knob = farthest(state, side as f32 * Vec3::X);
                 let at =
                     place.transform_point(Vec3::from(state.model().surface().positions()[knob as usize]));
-                commands.spawn((Grab::new(knob, 0.04, at.as_dvec3()), GrabOf(body), Hand { side }));
+                commands.spawn((Grab::new(knob, 0.04, at), GrabOf(body), Hand { side }));
             }
         }
     }

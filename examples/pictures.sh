@@ -98,6 +98,7 @@ picture() { # name of the picture, example, arguments
 picture hello_body hello_body
 picture many_bodies many_bodies
 picture materials materials
+picture elasticity elasticity
 picture free_bodies free_bodies
 picture falling falling
 picture pile pile

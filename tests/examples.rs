@@ -1,6 +1,7 @@
 //! Runs every example without a window, as the files in `tests/examples` specify.
 //!
-//! Each file names an example, its arguments, and what the example must print and write.
+//! Each file names an example, its arguments, and what the example must print and write, and must
+//! not print.
 //!
 //! ```sh
 //! cargo test -p pliant_examples              # builds the examples first, as any `cargo test` of the package does

@@ -45,9 +45,9 @@ pub struct Grab {
 
 impl Grab {
     /// Returns a grab of the patch within `radius` (m, model) of surface vertex `vertex`, pulled to
-    /// `target` (m, world).
-    pub fn new(vertex: u32, radius: f64, target: DVec3) -> Self {
-        Self { vertex, radius, target, stiffness: None, relaxation: 0.0 }
+    /// `target` (m, world), which may be a `Vec3` or a `DVec3`.
+    pub fn new(vertex: u32, radius: f64, target: impl Into<DVec3>) -> Self {
+        Self { vertex, radius, target: target.into(), stiffness: None, relaxation: 0.0 }
     }
 
     /// Returns the solver's settings of the grab. A change of any of them makes a new grab in the

@@ -67,13 +67,16 @@ impl Default for ProbeShape {
 }
 
 impl ProbeShape {
-    /// A capsule between two points, m from the tool point, axes of the probe.
-    pub fn capsule(from: DVec3, to: DVec3) -> Self {
-        Self { corners: vec![from, to] }
+    /// A capsule between two points, m from the tool point, axes of the probe. Each may be a `Vec3`
+    /// or a `DVec3`.
+    pub fn capsule(from: impl Into<DVec3>, to: impl Into<DVec3>) -> Self {
+        Self { corners: vec![from.into(), to.into()] }
     }
 
-    /// A box around the tool point. `half` has half of its edges without the rounding, m.
-    pub fn cuboid(half: DVec3) -> Self {
+    /// A box around the tool point. `half` has half of its edges without the rounding, m, as a
+    /// `Vec3` or a `DVec3`.
+    pub fn cuboid(half: impl Into<DVec3>) -> Self {
+        let half = half.into();
         let sign = |bit: usize, number: usize| if number >> bit & 1 == 0 { -1.0 } else { 1.0 };
         let corner = |number| half * DVec3::new(sign(0, number), sign(1, number), sign(2, number));
         Self { corners: (0..8).map(corner).collect() }
