@@ -70,6 +70,7 @@ mod ride_on;
 mod riding;
 mod saved;
 mod step;
+mod step_times;
 mod surface_anchor;
 mod surroundings;
 #[cfg(test)]
@@ -109,7 +110,8 @@ pub use probe::{ProbeShape, ProbeState, TouchProbe, Touching};
 pub use ride_on::RideOn;
 pub use riding::RidingPlugin;
 pub use saved::SavedState;
-pub use step::{BodyStepTimes, PliantTick, RigidBodies};
+pub use step::{PliantTick, RigidBodies};
+pub use step_times::BodyStepTimes;
 pub use surface_anchor::{SurfaceAnchor, SurfacePlace};
 pub use surroundings::FixedObstacles;
 pub use visual::{Pose, VisualState};

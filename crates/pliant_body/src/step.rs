@@ -1,14 +1,10 @@
 //! The fixed step: builds, places, grabs and steps the bodies, and publishes the results.
 
-use std::{
-    sync::{Arc, Weak},
-    time::Duration,
-};
+use std::sync::{Arc, Weak};
 
 use bevy::{
     diagnostic::Diagnostics,
     ecs::{
-        entity::EntityHashMap,
         name::NameOrEntityItem,
         system::{NonSendMarker, SystemParam},
     },
@@ -24,7 +20,7 @@ use pliant_modal::{
 use crate::{
     AWAKE_BODIES, BodyError, BodyReady, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabbed,
     Grabs, HeldShapesCache, ModalAsset, ModalBody, Pose, ProbeShape, ProbeState, Released, STEP_TIME,
-    SavedState, TouchProbe, VisualState, body::HeldBody, gravity::Pull,
+    SavedState, TouchProbe, VisualState, body::HeldBody, gravity::Pull, step_times::BodyStepTimes,
 };
 
 /// The tick: the number of steps that the schedule of the bodies has made.
@@ -38,54 +34,6 @@ pub struct PliantTick(pub u64);
 /// the contacts of the step did to them. Only a scene with such an engine has this resource.
 #[derive(Resource, Debug, Default)]
 pub struct RigidBodies(pub Vec<pliant_modal::Rigid>);
-
-/// Time that the newest step of each body has taken, for whoever asks.
-///
-/// Where the app has this resource, the steps of the ticks after a call of [`ask`](Self::ask) are
-/// measured. Bodies that are near other bodies, tools or rigid bodies are stepped together, and
-/// share the time of all such steps equally. The search for what is near is nobody's.
-#[derive(Resource, Debug, Default, Clone)]
-pub struct BodyStepTimes {
-    /// Number of ticks that are still measured.
-    asked: u32,
-    times: EntityHashMap<Duration>,
-}
-
-impl BodyStepTimes {
-    /// Number of ticks that are measured after a call of [`ask`](Self::ask).
-    pub const TICKS: u32 = 64;
-
-    /// Has the steps of the next [`TICKS`](Self::TICKS) ticks measured. Call it in every frame or
-    /// tick in which the times are looked at.
-    pub fn ask(&mut self) {
-        self.asked = Self::TICKS;
-    }
-
-    /// Time that the newest step of the body has taken. `None` if it was not stepped in the newest
-    /// tick, or if nobody has asked.
-    pub fn get(&self, body: Entity) -> Option<Duration> {
-        self.times.get(&body).copied()
-    }
-
-    /// Whether the steps of this tick are measured.
-    fn begin_tick(&mut self) -> bool {
-        self.times.clear();
-        let measured = self.asked > 0;
-        self.asked = self.asked.saturating_sub(1);
-        measured
-    }
-
-    /// Sets the times of a tick. The bodies that are not alone were stepped within `together`.
-    fn set(&mut self, bodies: &[Together<'_>], together: Duration) {
-        let awake = || bodies.iter().filter(|member| !member.resting);
-        let count = awake().filter(|member| !member.is_lone()).count() as u32;
-        let share = together.checked_div(count).unwrap_or_default();
-        self.times.extend(awake().filter_map(|member| {
-            let body = Entity::try_from_bits(member.key)?;
-            Some((body, if member.is_lone() { member.took } else { share }))
-        }));
-    }
-}
 
 /// Describes how the bodies' schedule runs.
 #[derive(Resource, Debug, Clone, Copy)]
@@ -400,7 +348,7 @@ pub(crate) fn step_bodies(
     mut refusals: Refusals,
     mut islands: Local<Islands>,
     mut rigids: Option<ResMut<RigidBodies>>,
-    mut times: Option<ResMut<BodyStepTimes>>,
+    times: Option<ResMut<BodyStepTimes>>,
     mut bodies: Query<(NameOrEntity, &ModalBody, &Driven, &mut BodyState)>,
     mut probes: Query<(NameOrEntity, &TouchProbe, &ProbeShape, &mut ProbeState)>,
 ) {
@@ -456,14 +404,14 @@ pub(crate) fn step_bodies(
     if let Some(rigids) = &mut rigids {
         std::mem::swap(&mut islands.rigids, &mut rigids.0);
     }
-    let mut measured = times.as_mut().filter(|times| times.asked > 0 || !times.times.is_empty());
-    let measures = measured.as_mut().is_some_and(|times| times.begin_tick());
+    let mut times = times.filter(|times| times.has_work());
+    let measures = times.as_mut().is_some_and(|times| times.begin_tick());
     let mut alone = start;
     islands.step_by(&mut together, &mut taken, step, may_touch, may_probe, |bodies, each| {
         on_all_threads(bodies, each, measures);
         alone = Instant::now();
     });
-    if let Some(times) = measured.filter(|_| measures) {
+    if let Some(mut times) = times.filter(|_| measures) {
         times.set(&together, alone.elapsed());
     }
     if let Some(rigids) = &mut rigids {

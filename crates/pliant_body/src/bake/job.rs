@@ -110,10 +110,8 @@ fn run(
             return Ok(Outcome::Cancelled);
         }
         let config = match paint {
-            Some(paint) if request.config.paint.is_none() => {
-                &BakeConfig { paint: Some(paint), ..request.config.clone() }
-            }
-            _ => &request.config,
+            Some(paint) => &BakeConfig { paint: Some(paint), ..request.config.clone() },
+            None => &request.config,
         };
         let mut progress = |stage, share| {
             let stage = match stage {
@@ -140,7 +138,7 @@ fn run(
 }
 
 /// Returns the tetrahedra, the visible surface if it is not their boundary, the repair of the input
-/// and what is painted in the file.
+/// and what is painted in the file, unless the request has a painting.
 fn mesh(
     request: &BakeRequest,
     shared: &BakeShared,
@@ -159,9 +157,9 @@ fn mesh(
         BakeShape::Input(input) => fill(Input::clone(input), &options, &mut progress)?,
         BakeShape::File(path) => {
             let (input, painted) = Paint::read(path)?;
-            // Before the long work.
-            painted.as_ref().map_or(Ok(()), Paint::check)?;
-            paint = painted;
+            // What the request has wins. The check comes before the long work.
+            paint = painted.filter(|_| request.config.paint.is_none());
+            paint.as_ref().map_or(Ok(()), Paint::check)?;
             fill(input, &options, &mut progress)?
         }
     };
