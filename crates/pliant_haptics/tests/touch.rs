@@ -9,7 +9,10 @@ use pliant_haptics::{
     TouchBall, TouchPlane, VirtualConfig, VirtualDevice, VirtualHandle, VirtualScheduler,
 };
 use pliant_modal::{Body, BodyConfig, Islands, ModalModel, Plane, Probe, ProbeConfig, Together};
-use rig::baked::{made_of, pip, top};
+use rig::{
+    baked::{made_of, pip, top},
+    valley::{VALLEY, valley},
+};
 
 /// A body of 15 cm or a rigid floor, a probe, and a loop whose workspace is 3 cm above the top.
 struct World {
@@ -39,12 +42,23 @@ const RADIUS: f64 = 0.01;
 
 impl World {
     fn new(young: Option<f64>, simulation: f64, device: VirtualConfig, hand: HandModel) -> Self {
-        let device = VirtualDevice::new(device, hand).unwrap();
-        let hand = device.handle();
         let model = young.map(|young| Arc::new(made_of(&pip(), young, 0.15)));
         let at = model
             .as_ref()
             .map_or([0.0; 3], |model| model.surface().positions()[top(model) as usize].map(f64::from));
+        Self::above(at, model, simulation, device, hand)
+    }
+
+    /// A world whose workspace is above a point, m, of the body.
+    fn above(
+        at: [f64; 3],
+        model: Option<Arc<ModalModel>>,
+        simulation: f64,
+        device: VirtualConfig,
+        hand: HandModel,
+    ) -> Self {
+        let device = VirtualDevice::new(device, hand).unwrap();
+        let hand = device.handle();
         let origin = [at[0], at[1] + RADIUS + GAP, at[2]];
         let tool = ToolMap { origin, ..ToolMap::default() };
         let cycle = Cycle::new(device, LoopConfig { tool, ..LoopConfig::default() }).unwrap();
@@ -229,6 +243,85 @@ fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
                 // Over the closed way the hand has paid.
                 assert!(world.cycle.device().work() <= 1e-6, "{name}: {}", world.cycle.device().work());
             }
+        }
+    }
+}
+
+/// Tools that lie in a valley with the lowest place where a ball touches both faces.
+const IN_VALLEY: [(&str, &[[f64; 3]]); 5] = [
+    ("ball", &[[0.0; 3]]),
+    ("capsule along", &[[0.0, 0.0, -0.02], [0.0, 0.0, 0.02]]),
+    ("end of a capsule", &[[0.0; 3], [0.0, 0.04, 0.0]]),
+    (
+        "edge of a box",
+        &[
+            [0.0, 0.0, -0.01],
+            [0.01, 0.01, -0.01],
+            [-0.01, 0.01, -0.01],
+            [0.0, 0.02, -0.01],
+            [0.0, 0.0, 0.01],
+            [0.01, 0.01, 0.01],
+            [-0.01, 0.01, 0.01],
+            [0.0, 0.02, 0.01],
+        ],
+    ),
+    ("top of a hull", &[[0.0; 3], [0.01, 0.03, 0.01], [-0.01, 0.03, 0.01], [0.0, 0.03, -0.01]]),
+];
+
+/// In a groove the hand feels what the simulation has, and leaves it without a kick.
+#[test]
+fn a_tool_in_a_groove_feels_what_the_simulation_has() {
+    for (young, (tool, corners)) in
+        [2e4, 1e6].into_iter().flat_map(|young| IN_VALLEY.map(|tool| (young, tool)))
+    {
+        for (simulation, hand) in [30.0, 60.0, 240.0]
+            .into_iter()
+            .flat_map(|rate| [(rate, HandModel::LIGHT), (rate, HandModel::FIRM)])
+        {
+            let at = [0.0, VALLEY + RADIUS * (2f64.sqrt() - 1.0), 0.0];
+            let model = Arc::new(valley(young));
+            let mut world = World::above(at, Some(model), simulation, VirtualConfig::touch(), hand);
+            world.probe.set_corners(corners).unwrap();
+            let name = format!("{tool}, E {young:.0e}, {simulation} Hz, {hand:?}");
+            world.lead(UP, UP, 0.5, |_| {});
+            world.lead(UP, DOWN, 0.5, |_| {});
+            world.lead(DOWN, DOWN, 2.0, |_| {});
+            // Of the loop and of the simulation, N.
+            let mut felt = [[f64::INFINITY, 0.0f64]; 2];
+            let mut planes = 0;
+            world.lead(DOWN, DOWN, 1.0, |world| {
+                for (felt, now) in felt.iter_mut().zip([world.force(), world.probe.force()]) {
+                    *felt = [felt[0].min(norm(now)), felt[1].max(norm(now))];
+                }
+                planes = planes.max(world.probe.contacts().len());
+            });
+            let most = felt[0][1];
+            let mut wish = std::mem::take(&mut world.wish);
+            for _ in 0..2 {
+                let side = [0.01, DOWN[1], 0.005];
+                world.lead(DOWN, side, 0.4, |_| {});
+                world.lead(side, DOWN, 0.4, |_| {});
+            }
+            wish = std::mem::take(&mut world.wish).max(wish);
+            world.lead(DOWN, UP, 0.5, |_| {});
+            world.lead(UP, UP, 0.2, |_| {});
+            println!(
+                "{name}: loop {:.3} to {:.3} N, simulation {:.3} to {:.3} N, {planes} contacts, given {:.1e} J, \
+                 wanted {wish:.3} N in the groove and {:.3} N out, in the end {:.1e} J",
+                felt[0][0],
+                felt[0][1],
+                felt[1][0],
+                felt[1][1],
+                world.given,
+                world.wish,
+                world.cycle.device().work()
+            );
+            let same = felt.iter().flatten().all(|f| (f / most - 1.0).abs() < 0.05);
+            assert!(same && most > 0.2, "{name}: {felt:?}");
+            assert_eq!(world.force(), [0.0; 3], "{name}: free air is free");
+            assert!(world.given <= 5e-3, "{name}: {}", world.given);
+            assert!(wish.max(world.wish) < 0.75 * most, "{name}: {wish} and {}", world.wish);
+            assert!(world.cycle.device().work() <= 1e-6, "{name}: {}", world.cycle.device().work());
         }
     }
 }

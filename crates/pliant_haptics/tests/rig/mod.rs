@@ -5,6 +5,7 @@ pub mod baked;
 pub mod block;
 pub mod machine;
 pub mod scene;
+pub mod valley;
 
 use pliant_haptics::{
     CouplingConfig, Cycle, HandModel, LocalModel, LoopConfig, LoopEvent, SafetyConfig, ToolContact,
