@@ -283,13 +283,19 @@ fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
     let soft = model(&grooved(STEEP), 5e4, Some("y<0.001"));
     let across = [[-0.02, 0.0, 0.0], [0.02, 0.0, 0.0]];
     let hull = [[0.0; 3], [0.01, 0.03, 0.01], [-0.01, 0.03, 0.01], [0.0, 0.03, -0.01]];
-    let tools: [(&str, &[[f64; 3]]); 4] =
-        [("ball", &[[0.0; 3]]), ("capsule along", &ALONG), ("capsule across", &across), ("hull", &hull)];
-    for (rate, (name, corners)) in [60.0, 1000.0].into_iter().flat_map(|rate| tools.map(|tool| (rate, tool)))
-    {
+    // With the height above a ball that touches both faces at which they touch, m.
+    let tools: [(&str, &[[f64; 3]], f64); 4] = [
+        ("ball", &[[0.0; 3]], 0.0),
+        ("capsule along", &ALONG, 0.0),
+        ("capsule across", &across, 0.02),
+        ("hull", &hull, 0.0),
+    ];
+    let all = [60.0, 1000.0].into_iter().flat_map(|rate| tools.map(|tool| (rate, tool)));
+    for (rate, (name, corners, height)) in all {
         for friction in [0.0, 0.5] {
             let mut bodies = [body(&soft, rate)];
-            let mut probes = [probe(RADIUS, STEEP.touching() + Vector3::new(0.0, 0.01, 0.0))];
+            let start = STEEP.touching() + Vector3::new(0.0, height, 0.0);
+            let mut probes = [probe(RADIUS, start + Vector3::new(0.0, 0.01, 0.0))];
             probes[0].configure(ProbeConfig { friction, ..*probes[0].config() }).unwrap();
             probes[0].set_corners(corners).unwrap();
             let mut islands = Islands::default();
@@ -298,7 +304,7 @@ fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
             for k in 0..=(8.0 * rate) as usize {
                 let t = std::f64::consts::TAU * k as f64 / (2.0 * rate);
                 let way = Vector3::new(0.012 * t.sin(), 0.003 + 0.007 * t.cos(), 0.01 * (2.0 * t).sin());
-                let to = STEEP.touching() + way;
+                let to = start + way;
                 probes[0].set_target(to.into()).unwrap();
                 step(&mut islands, &mut bodies, &mut probes, rate);
                 guarded += usize::from(bodies[0].contacts().report().guarded);

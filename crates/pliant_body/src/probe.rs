@@ -246,12 +246,17 @@ impl ProbeState {
         if known.is_none() {
             self.obstacles.clear();
         }
-        let corners: Vec<[f64; 3]> = shape.corners.iter().map(|corner| (*corner / scale).into()).collect();
+        // One more than there may be, so that too many are refused.
+        let mut corners = [[0.0; 3]; Probe::MAX_CORNERS + 1];
+        let count = shape.corners.len().min(corners.len());
+        for (to, from) in corners.iter_mut().zip(&shape.corners) {
+            *to = (*from / scale).into();
+        }
         let taken = known.map_or_else(|| Probe::new(config, target), Ok).and_then(|mut probe| {
             probe.configure(config)?;
             probe.set_target(target)?;
             probe.set_rotation(wanted.rotation.to_array())?;
-            probe.set_corners(&corners)?;
+            probe.set_corners(&corners[..count])?;
             Ok(probe)
         });
         self.scale = scale;

@@ -27,6 +27,8 @@ struct World {
     events: Vec<LoopEvent>,
     step: f64,
     next: f64,
+    /// Number of steps that were begun anew with implicit contacts.
+    guarded: usize,
     /// Largest change of the force in a period and largest work of the motors so far, N and J.
     jump: f64,
     /// Largest change in a period of the force that is wanted before the safety stages, N.
@@ -91,6 +93,7 @@ impl World {
             events: Vec::new(),
             step,
             next: 0.0,
+            guarded: 0,
             jump: 0.0,
             wish: 0.0,
             given: 0.0,
@@ -112,6 +115,7 @@ impl World {
             let probes = std::slice::from_mut(&mut self.probe);
             self.islands.step_with(&mut bodies, probes, self.step, |_, _| false, |_, _| true);
             assert!(bodies.iter().all(|body| body.error.is_none()));
+            self.guarded += bodies.iter().filter(|body| body.body.contacts().report().guarded).count();
             let config = *self.probe.config();
             let ball = TouchBall {
                 radius: config.radius,
@@ -119,7 +123,10 @@ impl World {
                 relaxation: config.relaxation,
                 lever: self.probe.lever(),
             };
-            let planes = self.probe.contacts().iter().map(|c| TouchPlane {
+            // What pushes comes first, as in the plugin.
+            let mut touched = self.probe.contacts().to_vec();
+            touched.sort_by(|a, b| norm(b.force).total_cmp(&norm(a.force)));
+            let planes = touched.iter().map(|c| TouchPlane {
                 key: 7,
                 spot: c.spot,
                 point: c.point,
@@ -225,11 +232,12 @@ fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
                 world.lead(UP, UP, 0.2, |_| {});
                 println!(
                     "{name}: {most:.2} N, given {:.1e} J, pull {pulled:.1e} N, jump {:.3} of {:.3} N, \
-                     wanted {:.3} N",
+                     wanted {:.3} N, {} guarded",
                     world.given,
                     world.jump,
                     slew(&world),
-                    world.wish
+                    world.wish,
+                    world.guarded
                 );
                 assert_eq!(world.force(), [0.0; 3], "{name}: free air is free");
                 assert!(most > 0.05, "{name}: {most}");
@@ -271,57 +279,52 @@ const IN_VALLEY: [(&str, &[[f64; 3]]); 5] = [
 /// In a groove the hand feels what the simulation has, and leaves it without a kick.
 #[test]
 fn a_tool_in_a_groove_feels_what_the_simulation_has() {
+    let at = [0.0, VALLEY + RADIUS * (2f64.sqrt() - 1.0), 0.0];
     for (young, (tool, corners)) in
         [2e4, 1e6].into_iter().flat_map(|young| IN_VALLEY.map(|tool| (young, tool)))
     {
-        for (simulation, hand) in [30.0, 60.0, 240.0]
-            .into_iter()
-            .flat_map(|rate| [(rate, HandModel::LIGHT), (rate, HandModel::FIRM)])
+        let model = Arc::new(valley(young));
+        let hands = [(HandModel::LIGHT, 0.0), (HandModel::FIRM, 0.5)];
+        for (simulation, (hand, friction)) in
+            [30.0, 60.0, 240.0].into_iter().flat_map(|rate| hands.map(|hand| (rate, hand)))
         {
-            let at = [0.0, VALLEY + RADIUS * (2f64.sqrt() - 1.0), 0.0];
-            let model = Arc::new(valley(young));
-            let mut world = World::above(at, Some(model), simulation, VirtualConfig::touch(), hand);
+            let mut world = World::above(at, Some(model.clone()), simulation, VirtualConfig::touch(), hand);
             world.probe.set_corners(corners).unwrap();
-            let name = format!("{tool}, E {young:.0e}, {simulation} Hz, {hand:?}");
+            world.probe.configure(ProbeConfig { friction, ..*world.probe.config() }).unwrap();
+            let name = format!("{tool}, E {young:.0e}, {simulation} Hz, friction {friction}");
             world.lead(UP, UP, 0.5, |_| {});
             world.lead(UP, DOWN, 0.5, |_| {});
             world.lead(DOWN, DOWN, 2.0, |_| {});
-            // Of the loop and of the simulation, N.
+            // Smallest and largest force of the loop and of the simulation, N.
             let mut felt = [[f64::INFINITY, 0.0f64]; 2];
-            let mut planes = 0;
+            let before = world.guarded;
             world.lead(DOWN, DOWN, 1.0, |world| {
                 for (felt, now) in felt.iter_mut().zip([world.force(), world.probe.force()]) {
                     *felt = [felt[0].min(norm(now)), felt[1].max(norm(now))];
                 }
-                planes = planes.max(world.probe.contacts().len());
             });
-            let most = felt[0][1];
-            let mut wish = std::mem::take(&mut world.wish);
+            let (most, guarded) = (felt[0][1], world.guarded - before);
             for _ in 0..2 {
                 let side = [0.01, DOWN[1], 0.005];
                 world.lead(DOWN, side, 0.4, |_| {});
                 world.lead(side, DOWN, 0.4, |_| {});
             }
-            wish = std::mem::take(&mut world.wish).max(wish);
+            let inside = std::mem::take(&mut world.wish);
             world.lead(DOWN, UP, 0.5, |_| {});
             world.lead(UP, UP, 0.2, |_| {});
+            let work = world.cycle.device().work();
             println!(
-                "{name}: loop {:.3} to {:.3} N, simulation {:.3} to {:.3} N, {planes} contacts, given {:.1e} J, \
-                 wanted {wish:.3} N in the groove and {:.3} N out, in the end {:.1e} J",
-                felt[0][0],
-                felt[0][1],
-                felt[1][0],
-                felt[1][1],
-                world.given,
-                world.wish,
-                world.cycle.device().work()
+                "{name}: loop {:.3} to {:.3} N, simulation {:.3} to {:.3} N, {guarded} guarded, wanted \
+                 {inside:.3} N inside and {:.3} N on the way out, given {:.1e} J, in the end {work:.1e} J",
+                felt[0][0], felt[0][1], felt[1][0], felt[1][1], world.wish, world.given
             );
+            // They differ where it sticks, and with more planes than the loop has room for.
             let same = felt.iter().flatten().all(|f| (f / most - 1.0).abs() < 0.05);
             assert!(same && most > 0.2, "{name}: {felt:?}");
+            assert!(felt.iter().all(|[least, most]| most - least < 0.01 * most), "{name}: {felt:?}");
             assert_eq!(world.force(), [0.0; 3], "{name}: free air is free");
-            assert!(world.given <= 5e-3, "{name}: {}", world.given);
-            assert!(wish.max(world.wish) < 0.75 * most, "{name}: {wish} and {}", world.wish);
-            assert!(world.cycle.device().work() <= 1e-6, "{name}: {}", world.cycle.device().work());
+            assert!(world.given <= 5e-3 && work <= 1e-6, "{name}: {} {work}", world.given);
+            assert!(inside.max(world.wish) < 0.25 * most, "{name}: {inside} and {}", world.wish);
         }
     }
 }

@@ -32,7 +32,7 @@ pub struct ToolContact {
 }
 
 /// Maximum number of planes that a tool touches at once.
-pub const MAX_PLANES: usize = 8;
+pub const MAX_PLANES: usize = 16;
 
 /// A plane that a place of the tool touches or is near: the surface of a body or of an obstacle.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -292,25 +292,31 @@ impl Touch {
 }
 
 /// The old slot of each plane: that of the same body or obstacle at which the tool's surface
-/// touches nearest to where it touches the plane. In a groove one place of the tool touches both
-/// sides.
+/// touches nearest to where it touches the plane, less than a radius away. In a groove one place of
+/// the tool touches both sides, and a plane does not go on with the force of another side.
 fn matches(old: &[TouchSlot], planes: &[TouchPlane], radius: f64) -> [Option<usize>; MAX_PLANES] {
-    let mut of = [None; MAX_PLANES];
-    loop {
-        let mut nearest: Option<(f64, usize, usize)> = None;
-        for (new, plane) in planes.iter().enumerate().filter(|(new, _)| of[*new].is_none()) {
-            for (known, slot) in old.iter().enumerate() {
-                let between = |[a, b]: [[f64; 3]; 2]| (Vector3::from(a) - Vector3::from(b)).norm();
-                let apart = between([slot.plane.spot, plane.spot])
-                    + radius * between([slot.plane.normal, plane.normal]);
-                let same = slot.plane.key == plane.key;
-                if same && !of.contains(&Some(known)) && nearest.is_none_or(|(least, ..)| apart < least) {
-                    nearest = Some((apart, new, known));
-                }
+    let between = |[a, b]: [[f64; 3]; 2]| (Vector3::from(a) - Vector3::from(b)).norm();
+    let mut apart = [[f64::INFINITY; SLOTS]; MAX_PLANES];
+    for (row, plane) in apart.iter_mut().zip(planes) {
+        for (apart, slot) in row.iter_mut().zip(old).filter(|(_, slot)| slot.plane.key == plane.key) {
+            let way =
+                between([slot.plane.spot, plane.spot]) + radius * between([slot.plane.normal, plane.normal]);
+            if way < radius {
+                *apart = way;
             }
         }
+    }
+    let mut of = [None; MAX_PLANES];
+    loop {
+        let all = apart
+            .iter()
+            .enumerate()
+            .flat_map(|(new, row)| row.iter().enumerate().map(move |(known, apart)| (*apart, new, known)));
+        let nearest = all.min_by(|a, b| a.0.total_cmp(&b.0)).filter(|nearest| nearest.0 < f64::INFINITY);
         let Some((_, new, known)) = nearest else { return of };
         of[new] = Some(known);
+        apart[new] = [f64::INFINITY; SLOTS];
+        apart.iter_mut().for_each(|row| row[known] = f64::INFINITY);
     }
 }
 

@@ -137,7 +137,9 @@ pub(crate) struct ProbeMemory {
 /// of the step, so the forces on a body and on the probe are equal and opposite, and the probe
 /// stays on the surface while the target goes in. It touches each body and each obstacle with the
 /// corners that are near, and with the place between them that is nearest; each body also with
-/// places between the corners, one for each of its sites.
+/// places between the corners, one for each of its sites. In a groove of a body the corners and the
+/// places between them touch both sides: a body has at most two contacts with each of up to 64
+/// places that stay.
 #[derive(Debug, Clone)]
 pub struct Probe {
     config: ProbeConfig,
@@ -277,7 +279,8 @@ impl Probe {
                 }
             }
         }
-        let room = self.seeds.len() + 1;
+        // Each place may touch both sides of a groove.
+        let room = 2 * self.seeds.len() + 1;
         self.contacts.reserve(room);
         self.memory.reserve(room);
         self.forget();
@@ -291,10 +294,6 @@ impl Probe {
     /// The places that stay: the corners, and then those between them.
     pub(crate) fn spots(&self) -> impl Iterator<Item = Spot> + '_ {
         self.seeds.iter().enumerate().map(|(number, at)| Spot { at: *at, fixed: Some(number) })
-    }
-
-    pub(crate) fn is_ball(&self) -> bool {
-        self.corners == 1 && !self.turns()
     }
 
     /// Whether a place that stays lies between corners.

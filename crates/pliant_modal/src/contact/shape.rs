@@ -296,7 +296,7 @@ impl Shape<'_> {
         };
         let fits = |near: &Near| match side {
             Side::All => true,
-            Side::Along(normal) => near.normal.dot(normal) >= ALONG,
+            Side::Along(normal) => near.normal.dot(normal) >= ALONG && near.distance > 0.0,
             Side::Beside(normal) => near.normal.dot(normal) < ALONG && near.distance > 0.0,
         };
         let local = self.frame.to_local(point);

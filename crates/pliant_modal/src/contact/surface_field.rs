@@ -98,7 +98,7 @@ pub(crate) struct Bent {
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Side {
     All,
-    /// Those of the side of a groove that has this normal.
+    /// Those of the side of a groove that has this normal, where the point is in front of them.
     Along(Vector3<f64>),
     /// Those of another side of a groove, where they lie below the point.
     Beside(Vector3<f64>),
@@ -345,7 +345,7 @@ impl SurfaceField {
                 (point, within, hint),
                 |node| node.along(of)[1] < ALONG,
                 |normal| of.dot(normal) >= ALONG,
-                |_, _| true,
+                |normal, way| normal.dot(way) > 0.0,
             ),
             Side::Beside(of) => self.search(
                 (point, within, hint),

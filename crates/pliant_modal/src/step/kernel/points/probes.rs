@@ -54,26 +54,26 @@ fn plane_of(near: &Near, center: &Vector3<f64>) -> [Vector3<f64>; 2] {
 /// a groove, as a share of the radius.
 const ABOVE: f64 = 0.05;
 
-/// Whether two planes that a ball touches are the sides of a groove: each place lies above the
-/// plane of the other. Two faces that meet in an edge are none, and a contact moves from one to the
-/// other. Other shapes touch one side, because their places slide over them.
-fn is_groove(probe: &Probe, [a, n]: &[Vector3<f64>; 2], [b, m]: &[Vector3<f64>; 2]) -> bool {
+/// Whether two planes that a place of a probe touches are the sides of a groove: each touches above
+/// the plane of the other. Two faces that meet in an edge are none, and a contact moves from one to
+/// the other. A place that slides over the probe touches one side.
+fn is_groove(probe: &Probe, spot: &Spot, [a, n]: &[Vector3<f64>; 2], [b, m]: &[Vector3<f64>; 2]) -> bool {
     let (way, least) = (b - a, ABOVE * probe.config().radius);
-    probe.is_ball() && n.dot(m) < ALONG && n.dot(&way) > least && -m.dot(&way) > least
+    spot.fixed.is_some() && n.dot(m) < ALONG && n.dot(&way) > least && -m.dot(&way) > least
 }
 
 /// The place of a body that is nearest to a point (m, world axes), no farther than `within` (m). Of
 /// the two sides of a groove it is that of the plane of the contact, as long as it is there.
 /// Without that a contact would alternate between the sides, and each time lose its force.
 fn on_side(
-    (probe, plane): (&Probe, &[Vector3<f64>; 2]),
+    (probe, spot, plane): (&Probe, &Spot, &[Vector3<f64>; 2]),
     shape: &Shape<'_>,
     point: &Vector3<f64>,
     within: f64,
     hint: Option<&Place>,
 ) -> Option<Near> {
     let near = shape.nearest(point, within, hint)?;
-    if is_groove(probe, plane, &plane_of(&near, point)) {
+    if is_groove(probe, spot, plane, &plane_of(&near, point)) {
         return shape.nearest_of(point, &Side::Along(plane[1]), within, hint);
     }
     Some(near)
@@ -133,11 +133,11 @@ pub(in super::super) fn begin_probes<P: Member>(
                         Ok(normal_of(shape.nearest(x, within, Some(&hint)), &mut hint))
                     })?;
                     let center = probe.begun(&spot.at);
-                    let near = on_side((probe, &memory.plane), &shape, &center, within, Some(&place));
+                    let near = on_side((probe, &spot, &memory.plane), &shape, &center, within, Some(&place));
                     let near = near.unwrap_or_else(|| shape.at(&place, &center));
                     let plane = plane_of(&near, &center);
                     let same = |point: &ContactPoint, at: &AtProbe| {
-                        is_at_body(point, at, member, index) && !is_groove(probe, &plane, &at.plane)
+                        is_at_body(point, at, member, index) && !is_groove(probe, &spot, &plane, &at.plane)
                     };
                     if is_taken(work, same, &spot, radius) {
                         continue;
@@ -397,7 +397,7 @@ fn detect_at_obstacle<P: Member>(
 }
 
 /// As [`detect_at_obstacle`], at a body, with the places between corners that penetrate, one for
-/// each site, and with both sides of a groove in which a ball lies.
+/// each site, and with both sides of a groove in which a place lies that stays.
 fn detect_at_body<P: Member>(
     group: &Group<'_, P>,
     work: &mut Touching,
@@ -481,41 +481,41 @@ fn detect_at_body<P: Member>(
             add(work, spot, &near, passed);
         }
     }
-    // In a step a ball does not go so far that it meets another side that was not near at first.
-    if is_first
-        && let Some((spot, near)) =
-            beside(probe, &end, work, |point, at| is_at_body(point, at, member, index))
-    {
-        add(work, spot, &near, false);
-    }
     // A soft surface is pressed along the whole length between corners.
     for (near, passed, spot) in between.drain(..) {
         if !is_taken(work, |point, at| is_at_body(point, at, member, index), &spot, radius) {
             add(work, spot, &near, passed);
         }
     }
+    // In a step no place goes so far that it meets another side that was not near at first.
+    if is_first {
+        for spot in probe.spots() {
+            let near = beside(probe, &spot, &end, work, |point, at| is_at_body(point, at, member, index));
+            if let Some(near) = near {
+                add(work, spot, &near, false);
+            }
+        }
+    }
     work.between = between;
     Ok(penetrates)
 }
 
-/// The other side of the groove in which a ball lies that touches one, and the place of the ball.
+/// The other side of the groove in which a place of a probe lies that touches one.
 fn beside(
     probe: &Probe,
+    spot: &Spot,
     shape: &Shape<'_>,
     work: &Touching,
     of: impl Fn(&ContactPoint, &AtProbe) -> bool,
-) -> Option<(Spot, Near)> {
-    if !probe.is_ball() {
-        return None;
-    }
+) -> Option<Near> {
     let sides = work.points.iter().filter_map(|point| Some((point, point.probe?)));
-    let mut sides = sides.filter(|(point, at)| of(point, at));
+    let mut sides = sides.filter(|(point, at)| at.spot.fixed == spot.fixed && of(point, at));
     let (Some((point, at)), None) = (sides.next(), sides.next()) else { return None };
     if point.passed {
         return None;
     }
-    let center = probe.ended(&at.spot.at);
+    let center = probe.ended(&spot.at);
     let reach = 2.0 * probe.config().radius;
     let near = shape.nearest_of(&center, &Side::Beside(at.plane[1]), reach, at.last.as_ref())?;
-    is_groove(probe, &at.plane, &plane_of(&near, &center)).then_some((at.spot, near))
+    is_groove(probe, spot, &at.plane, &plane_of(&near, &center)).then_some(near)
 }

@@ -53,7 +53,11 @@ pub(in super::super) fn linearize_at_probe<P: Member>(
                 })?;
             }
             let x = probe.ended(&at.nearest.at);
-            let near = if far { None } else { on_side((probe, &at.plane), &shape, &x, within, Some(&last)) };
+            let near = if far {
+                None
+            } else {
+                on_side((probe, &at.spot, &at.plane), &shape, &x, within, Some(&last))
+            };
             let near = near.unwrap_or_else(|| shape.at(&last, &x));
             (at.last, at.plane) = (Some(near.place), plane_of(&near, &x));
             let (end, tangent): (_, Tangent) = shape.material(place, carriers);
