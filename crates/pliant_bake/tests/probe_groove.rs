@@ -283,7 +283,8 @@ fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
     let soft = model(&grooved(STEEP), 5e4, Some("y<0.001"));
     let across = [[-0.02, 0.0, 0.0], [0.02, 0.0, 0.0]];
     let hull = [[0.0; 3], [0.01, 0.03, 0.01], [-0.01, 0.03, 0.01], [0.0, 0.03, -0.01]];
-    // With the height above a ball that touches both faces at which they touch, m.
+    // With the height above a ball that touches both faces at which they touch, m. The capsule that
+    // lies across gives energy where it goes 2 cm deeper (docs/contact.md).
     let tools: [(&str, &[[f64; 3]], f64); 4] = [
         ("ball", &[[0.0; 3]], 0.0),
         ("capsule along", &ALONG, 0.0),
