@@ -172,30 +172,6 @@ fn a_report_says_what_crosses_the_papers_networks() {
     }
 }
 
-/// Fastest of some thousand passes over as many bytes, GB/s: plain sums in the widest registers,
-/// and comparisons of two halves by the system's library.
-fn reads_gb_s(bytes: usize) -> [f64; 2] {
-    let fastest = |pass: &mut dyn FnMut()| {
-        let mut us = f64::INFINITY;
-        for _ in 0..5_000 {
-            let began = std::time::Instant::now();
-            pass();
-            us = us.min(began.elapsed().as_secs_f64() * 1e6);
-        }
-        bytes as f64 / us.max(1e-9) * 1e-3
-    };
-    let numbers = vec![1f32; bytes / 4];
-    let halves = [vec![1u8; bytes / 2], vec![1u8; bytes / 2]];
-    let sum = fastest(&mut || {
-        std::hint::black_box(pliant_modal::streaming_sum(std::hint::black_box(&numbers)));
-    });
-    let compared = fastest(&mut || {
-        let [a, b] = std::hint::black_box(&halves);
-        assert!(std::hint::black_box(a == b));
-    });
-    [sum, compared]
-}
-
 /// Held by what measures times and by what takes all cores for minutes.
 static CORES: Mutex<()> = Mutex::new(());
 
@@ -221,25 +197,12 @@ fn a_body_is_timed_against_the_memory() {
     let speed = told["bandwidth_gb_s"].as_f64().unwrap();
     let expected = told["bytes"].as_f64().unwrap() / median(&told, "reconstruct_us") * 1e-3;
     assert!((speed / expected - 1.0).abs() < 1e-9, "{speed} GB/s instead of {expected}");
-    // The limit is that of this machine: the fastest sums of as many bytes in this process, which
-    // fit in a cache, are as fast. A frame is a step under a hand and a surface, and not one of
-    // them alone: without the surface it takes as long as a step. A core may change its speed
-    // between two timings, so that one of three runs has to be right.
-    let mut tries = Vec::new();
-    let right = (0..3).any(|_| {
-        let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
-        let limit = told["bandwidth_limit_gb_s"].as_f64().unwrap();
-        let [here, compared] = reads_gb_s(told["bytes"].as_u64().unwrap() as usize);
-        let step = median(&told, "frame_us") - median(&told, "reconstruct_us");
-        let alone = median(&told, "step_us");
-        tries.push(format!(
-            "limit {limit:.1} GB/s, by sums {here:.1} and by comparisons {compared:.1} here; a step of \
-             {step:.2} us in a frame and of {alone:.2} us alone"
-        ));
-        (0.75..1.25).contains(&(limit / here)) && (0.6..1.5).contains(&(step / alone))
-    });
-    println!("{tries:#?}");
-    assert!(right, "{tries:#?}");
+    // No surface is faster than the limit of the memory. That it is the fastest of sums and surfaces
+    // and that a frame is a step and a surface is tried on a clock of their own (bench.rs of
+    // pliant_lab): a core may change its speed between two timings.
+    let limit = told["bandwidth_limit_gb_s"].as_f64().unwrap();
+    assert!(speed <= limit, "{told}");
+    assert!(median(&told, "reconstruct_us") < median(&told, "frame_us"), "{told}");
     // Four times as many vertices and twice the modes take at least three times as long.
     let (fine, finer) = (folder.file("fine.msh"), folder.file("fine.modal"));
     succeeds(&["mesh", "bar", "--cells", "16,4,4", "--size", "1,0.2,0.2", "-o", &fine]);
