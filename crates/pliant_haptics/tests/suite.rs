@@ -10,5 +10,6 @@ mod plugin;
 mod rig;
 mod sources;
 mod stability;
+mod strokes;
 mod tool;
 mod touch;

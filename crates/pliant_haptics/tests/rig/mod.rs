@@ -6,6 +6,7 @@ pub mod block;
 pub mod machine;
 pub mod scene;
 pub mod valley;
+pub mod world;
 
 use pliant_haptics::{
     CouplingConfig, Cycle, HandModel, LocalModel, LoopConfig, LoopEvent, SafetyConfig, ToolContact,
