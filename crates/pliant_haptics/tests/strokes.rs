@@ -54,7 +54,7 @@ fn a_thin_capsule_strokes_an_ear_without_a_kick() {
         assert!(world.jump <= slew(&world) * 1.000_001, "{name}: {}", world.jump);
         assert!(world.given <= 5e-3, "{name}: {}", world.given);
         // What the spring of the tool gives in a period is the rest.
-        let bound = 1.5 * most * simulation * 1e-3 + 0.04;
+        let bound = 1.5 * most * simulation * 1e-3 + 0.05;
         if world.wish > bound {
             kicks.push(format!("{name}: {:.3} N in a period, may be {bound:.3} N", world.wish));
         }

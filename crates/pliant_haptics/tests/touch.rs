@@ -73,10 +73,11 @@ fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
                 assert!(world.given <= 5e-3, "{name}: {}", world.given);
                 assert!(pulled >= -1e-3, "{name}: {pulled}");
                 assert!(world.jump <= slew(&world) * 1.000_001, "{name}: {}", world.jump);
-                // The slew limit alone would let a kick of any size through as a ramp.
-                // Several planes of a sharp horn may turn the force of a capsule at once.
-                let bound = if corners.len() == 1 { 0.75 * most } else { most.max(back) };
-                assert!(world.wish < bound, "{name}: {} of {most} and {back}", world.wish);
+                // The slew limit alone would let a kick of any size through as a ramp. What another
+                // update brings takes an update, and the spring of the tool gives the rest.
+                let most = most.max(back);
+                let bound = 1.5 * most * simulation * 1e-3 + 0.05;
+                assert!(world.wish < bound, "{name}: {} of {most}", world.wish);
                 // Over the closed way the hand has paid.
                 assert!(world.cycle.device().work() <= 1e-6, "{name}: {}", world.cycle.device().work());
             }
@@ -85,9 +86,10 @@ fn pressing_stroking_and_lifting_stay_passive_without_a_kick() {
 }
 
 /// Tools that lie in a valley with the lowest place where a ball touches both faces.
-const IN_VALLEY: [(&str, &[[f64; 3]]); 5] = [
+const IN_VALLEY: [(&str, &[[f64; 3]]); 6] = [
     ("ball", &[[0.0; 3]]),
     ("capsule along", &[[0.0, 0.0, -0.02], [0.0, 0.0, 0.02]]),
+    ("capsule across", &[[-0.02, 0.02, 0.0], [0.02, 0.02, 0.0]]),
     ("end of a capsule", &[[0.0; 3], [0.0, 0.04, 0.0]]),
     (
         "edge of a box",

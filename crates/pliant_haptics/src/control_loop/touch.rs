@@ -32,13 +32,20 @@ pub(crate) struct TouchForces {
 #[derive(Debug, Clone, Copy, Default)]
 struct TouchSlot {
     plane: TouchPlane,
+    /// Outward normal in this period and at the last update, unit length, world axes. It turns from
+    /// the one to that of the plane until the next update.
+    normal: Vector3<f64>,
+    from: Vector3<f64>,
     /// Height by which the plane lies behind the received one, m, and how fast this decays, m/s.
     lag: f64,
     rate: f64,
-    /// Whether the last update has the plane no more. It then goes away at the rate.
-    leaves: bool,
+    /// The force along the normal, N, that it had when an update came without it. From there on it
+    /// yields to less and less, so that what stands beside it takes over as slowly.
+    leaves: Option<f64>,
     /// Where the center of the sphere sticks, m. Set while the plane is touched.
     anchor: Option<Vector3<f64>>,
+    /// Velocity of the anchor until the next update, m/s.
+    drift: Vector3<f64>,
     /// Force on the tool: along the normal and two tangents, N.
     force: Vector3<f64>,
 }
@@ -74,9 +81,9 @@ impl Held {
         self.position + self.orientation * Vector3::from(plane.spot)
     }
 
-    /// From the tool point to where the plane touches, m, world axes.
-    fn arm(&self, plane: &TouchPlane) -> Vector3<f64> {
-        self.orientation * Vector3::from(plane.spot) - self.radius * Vector3::from(plane.normal)
+    /// From the tool point to where a plane touches, m, world axes.
+    fn arm(&self, slot: &TouchSlot) -> Vector3<f64> {
+        self.orientation * Vector3::from(slot.plane.spot) - self.radius * slot.normal
     }
 
     /// Displacement by the spring's give at an arm, m.
@@ -95,12 +102,18 @@ impl TouchSlot {
     /// Distance of a sphere to the received plane after `age` seconds, m.
     fn gap(&self, center: &Vector3<f64>, radius: f64, age: f64) -> f64 {
         let at = Vector3::from(self.plane.point) + Vector3::from(self.plane.velocity) * age;
-        Vector3::from(self.plane.normal).dot(&(center - at)) - radius
+        self.normal.dot(&(center - at)) - radius
+    }
+
+    /// Turns the normal to where it is at a share of the way to that of the plane.
+    fn turn(&mut self, share: f64) {
+        let to = Vector3::from(self.plane.normal);
+        self.normal = (self.from + (to - self.from) * share).try_normalize(0.1).unwrap_or(to);
     }
 
     /// Rows: the normal and two tangents.
     fn axes(&self) -> Matrix3<f64> {
-        let normal = Vector3::from(self.plane.normal);
+        let normal = self.normal;
         let first = normal.cross(&Vector3::ith(normal.iamin(), 1.0)).normalize();
         let second = normal.cross(&first);
         Matrix3::from_rows(&[normal.transpose(), first.transpose(), second.transpose()])
@@ -137,33 +150,26 @@ impl Touch {
         self.touches
     }
 
-    /// Takes the planes of a new update. A plane that is touched goes on where it was, and from
-    /// there to where the update has it. Another plane in which the tool already is begins at the
-    /// tool, without force. A plane that is touched and that the update has no more goes away as
-    /// slowly.
-    fn take(&mut self, now: f64, age: f64, model: &LocalModel, held: &Held) {
+    /// Takes the planes of a new update. Each force is at first what it was, and goes from there to
+    /// what the update has. A plane that goes on with the force of an old one begins where it gives
+    /// this force, and turned as the old one: its dent may be several times as soft or as stiff,
+    /// since a place shares its site with others that come and go. A plane in which the tool already
+    /// is begins at the tool, without force. One that is touched and that the update has no more
+    /// pushes less and less.
+    fn take(&mut self, now: f64, model: &LocalModel, held: &Held) {
         let (old, known) = (self.slots, self.count);
         (self.tick, self.since) = (model.tick, now);
         self.count = model.planes().len();
         let interval = interval(model).max(1e-3);
-        let of = matches(&old[..known], model.planes(), held.radius);
+        let of = matches(&old[..known], model.planes(), held);
         for ((slot, plane), of) in self.slots.iter_mut().zip(model.planes()).zip(of) {
-            let last = of.and_then(|of| old.get(of));
-            let touched = last.filter(|slot| slot.force.x > 0.0);
-            *slot = TouchSlot { plane: *plane, leaves: false, ..touched.copied().unwrap_or_default() };
-            let center = held.center(plane);
-            let gap = slot.gap(&center, held.radius, 0.0);
-            slot.lag = match touched {
-                Some(last) => last.gap(&held.center(&last.plane), held.radius, age) + last.lag - gap,
-                None => (-gap).max(0.0),
-            };
-            slot.rate = slot.lag.abs() / interval;
-            // The force keeps its direction in the world, and what sticks its way from the tool.
-            slot.force =
-                touched.map_or_else(Vector3::zeros, |last| slot.axes() * last.axes().tr_mul(&last.force));
-            if let (Some(anchor), Some(last)) = (&mut slot.anchor, touched) {
-                *anchor += center - held.center(&last.plane);
-            }
+            let touched = of.and_then(|of| old.get(of));
+            let normal = touched.map_or_else(|| Vector3::from(plane.normal), |last| last.normal);
+            let force = touched.map_or_else(Vector3::zeros, |last| last.force);
+            *slot = TouchSlot { plane: *plane, normal, from: normal, force, ..TouchSlot::default() };
+            // What sticks keeps its way from the tool in the end, and its force at first.
+            slot.anchor =
+                touched.and_then(|last| Some(last.anchor? + (held.center(plane) - held.center(&last.plane))));
         }
         let loaded = old[..known].iter().enumerate().filter(|(_, slot)| slot.force.x > 0.0);
         for (number, last) in loaded {
@@ -171,14 +177,28 @@ impl Touch {
                 continue;
             }
             let Some(slot) = self.slots.get_mut(self.count) else { break };
-            *slot = TouchSlot { leaves: true, ..*last };
-            let center = held.center(&last.plane);
-            slot.lag += last.gap(&center, held.radius, age) - last.gap(&center, held.radius, 0.0);
-            slot.plane.velocity = [0.0; 3];
-            let (normal, arm) = (Vector3::from(slot.plane.normal), held.arm(&slot.plane));
-            let give = normal.dot(&((slot.compliance() + held.response(&arm)) * normal));
-            slot.rate = slot.force.x * give / interval;
+            *slot = TouchSlot { leaves: Some(last.force.x), from: last.normal, ..*last };
+            (slot.plane.normal, slot.plane.velocity) = (last.normal.into(), [0.0; 3]);
             self.count += 1;
+        }
+        let slots = &mut self.slots[..self.count];
+        let mut total = Sum::default();
+        for slot in &*slots {
+            total.add(&slot.axes().tr_mul(&slot.force), &held.arm(slot));
+        }
+        for slot in slots {
+            let (axes, arm) = (slot.axes(), held.arm(slot));
+            let at = held.center(&slot.plane) + held.give(&total, &arm);
+            let dent = slot.compliance() * axes.tr_mul(&slot.force);
+            let gap = slot.gap(&at, held.radius, 0.0) + slot.normal.dot(&dent);
+            if slot.force.x > 0.0 {
+                let anchor = at + dent;
+                slot.drift = (slot.anchor.unwrap_or(anchor) - anchor) / interval;
+                (slot.lag, slot.anchor) = (-gap, Some(anchor));
+            } else {
+                slot.lag = (-gap).max(0.0);
+            }
+            slot.rate = if slot.leaves.is_some() { 0.0 } else { slot.lag.abs() / interval };
         }
     }
 
@@ -194,11 +214,11 @@ impl Touch {
         let turning = if ball.lever > 0.0 { soft / (ball.lever * ball.lever) } else { 0.0 };
         let (position, orientation) = (tool.position, tool.orientation);
         let held = Held { position, orientation, radius: ball.radius, soft, turning };
-        let age = |now: f64, since: f64| (now - since).clamp(0.0, interval(model));
         if model.tick != self.tick {
-            self.take(now, age(now, self.since), model, &held);
+            self.take(now, model, &held);
         }
-        let age = age(now, self.since);
+        let age = (now - self.since).clamp(0.0, interval(model));
+        let share = ((now - self.since) / interval(model).max(1e-3)).clamp(0.0, 1.0);
         let turned = orientation * std::mem::replace(&mut self.orientation, orientation).inverse();
         let mut out = TouchForces::default();
         self.touches = false;
@@ -209,22 +229,27 @@ impl Touch {
         let slots = &mut self.slots[..self.count];
         let mut total = Sum::default();
         for slot in &mut *slots {
-            slot.lag +=
-                if slot.leaves { slot.rate * dt } else { -slot.lag.clamp(-slot.rate * dt, slot.rate * dt) };
+            let force = slot.axes().tr_mul(&slot.force);
+            slot.turn(share);
+            slot.force = slot.axes() * force;
+            slot.lag -= slot.lag.min(slot.rate * dt).max(-slot.rate * dt);
             if let Some(anchor) = &mut slot.anchor {
                 *anchor += Vector3::from(slot.plane.velocity) * dt;
+                if share < 1.0 {
+                    *anchor += slot.drift * dt;
+                }
                 if turning > 0.0 {
                     // A tool that turns takes what touches along, but not the center of its sphere.
-                    let below = -held.radius * Vector3::from(slot.plane.normal);
+                    let below = -held.radius * slot.normal;
                     *anchor -= turned * below - below;
                 }
             }
-            total.add(&slot.axes().tr_mul(&slot.force), &held.arm(&slot.plane));
+            total.add(&force, &held.arm(slot));
         }
         for _ in 0..SWEEPS {
             let mut moved = 0.0f64;
             for slot in &mut *slots {
-                let (axes, arm, center) = (slot.axes(), held.arm(&slot.plane), held.center(&slot.plane));
+                let (axes, arm, center) = (slot.axes(), held.arm(slot), held.center(&slot.plane));
                 let response = axes * (slot.compliance() + held.response(&arm)) * axes.transpose();
                 let mut others = total;
                 others.add(&-axes.tr_mul(&slot.force), &arm);
@@ -233,7 +258,11 @@ impl Touch {
                 let anchor = slot.anchor.unwrap_or(center);
                 let along = axes * (free_center - anchor);
                 let free = Vector3::new(gap, along[1], along[2]);
-                let (force, _) = contact_force(&response, &free, slot.plane.friction, &slot.force);
+                let (mut force, _) = contact_force(&response, &free, slot.plane.friction, &slot.force);
+                let most = slot.leaves.map_or(f64::INFINITY, |force| force * (1.0 - share));
+                if force.x > most {
+                    force *= most / force.x;
+                }
                 moved = moved.max((force - slot.force).norm());
                 slot.force = force;
                 total = others;
@@ -250,23 +279,30 @@ impl Touch {
                 continue;
             }
             self.touches = true;
-            let (axes, arm, center) = (slot.axes(), held.arm(&slot.plane), held.center(&slot.plane));
+            let (axes, arm, center) = (slot.axes(), held.arm(slot), held.center(&slot.plane));
             let at = center + held.give(&total, &arm);
             let force = axes.tr_mul(&slot.force);
             let dent = slot.compliance() * force;
+            if slot.leaves.is_some() {
+                slot.lag = -(slot.gap(&at, held.radius, age) + slot.normal.dot(&dent));
+            }
             let across = slot.force.y.hypot(slot.force.z);
             let most = slot.plane.friction * slot.force.x;
             let sticks = across < most * (1.0 - 1e-9);
-            // A contact that slides takes its anchor along.
-            slot.anchor = if sticks { slot.anchor.or(Some(center)) } else { Some(at + dent) };
+            // A contact that slides takes its anchor along. What sticks is held across the normal.
+            let free = at + dent;
+            let anchor = slot.anchor.filter(|_| sticks).unwrap_or(free);
+            if !sticks {
+                slot.drift = Vector3::zeros();
+            }
+            slot.anchor = Some(anchor + slot.normal * slot.normal.dot(&(free - anchor)));
             out.stored += 0.5 * force.dot(&dent);
             // The damper is in series with the dent as the spring is. It never pushes harder than
             // the spring, so that neither the first touch nor the last is an impulse, and it stays
             // in the cone.
-            let normal = Vector3::from(slot.plane.normal);
-            let give = (slot.compliance() + held.response(&arm)) * normal;
+            let give = (slot.compliance() + held.response(&arm)) * slot.normal;
             // Beside others it has a share of the damper.
-            let damping = slot.force.x / pushed * ball.relaxation / normal.dot(&give);
+            let damping = slot.force.x / pushed * ball.relaxation / slot.normal.dot(&give);
             let mut drag = axes * (Vector3::from(slot.plane.velocity) - tool.velocity) * damping;
             drag.x = drag.x.clamp(-slot.force.x, slot.force.x);
             let normal = slot.force.x + drag.x;
@@ -291,17 +327,23 @@ impl Touch {
     }
 }
 
-/// The old slot of each plane: that of the same body or obstacle at which the tool's surface
-/// touches nearest to where it touches the plane, less than a radius away. In a groove one place of
-/// the tool touches both sides, and a plane does not go on with the force of another side.
-fn matches(old: &[TouchSlot], planes: &[TouchPlane], radius: f64) -> [Option<usize>; MAX_PLANES] {
-    let between = |[a, b]: [[f64; 3]; 2]| (Vector3::from(a) - Vector3::from(b)).norm();
+/// The old slot of each plane in which the tool is: one that pushes, of the same body or obstacle,
+/// at which the tool's surface touches nearest to where it touches the plane, less than a radius
+/// away. In a groove one place of the tool touches both sides, and a plane does not go on with the
+/// force of another side.
+fn matches(old: &[TouchSlot], planes: &[TouchPlane], held: &Held) -> [Option<usize>; MAX_PLANES] {
+    let between = |a: [f64; 3], b: Vector3<f64>| (Vector3::from(a) - b).norm();
     let mut apart = [[f64::INFINITY; SLOTS]; MAX_PLANES];
     for (row, plane) in apart.iter_mut().zip(planes) {
-        for (apart, slot) in row.iter_mut().zip(old).filter(|(_, slot)| slot.plane.key == plane.key) {
-            let way =
-                between([slot.plane.spot, plane.spot]) + radius * between([slot.plane.normal, plane.normal]);
-            if way < radius {
+        let normal = Vector3::from(plane.normal);
+        if normal.dot(&(held.center(plane) - Vector3::from(plane.point))) >= held.radius {
+            continue;
+        }
+        let pushes = |slot: &TouchSlot| slot.plane.key == plane.key && slot.force.x > 0.0;
+        for (apart, slot) in row.iter_mut().zip(old).filter(|(_, slot)| pushes(slot)) {
+            let way = between(plane.spot, slot.plane.spot.into())
+                + held.radius * between(plane.normal, slot.normal);
+            if way < held.radius {
                 *apart = way;
             }
         }
@@ -344,6 +386,44 @@ mod tests {
             tool.update(Vector3::y() * 0.006, Vector3::zeros(), turn, 0, false);
             let forces = touch.forces(1e-3 * tick as f64, 1e-3, &tool, &model);
             assert!(forces.elastic.xz().norm() < 1e-9, "{}", forces.elastic);
+        }
+    }
+
+    /// Largest change of the force in a period and the largest force, N, of a tool that is drawn
+    /// over what alternates between two planes. An update comes every 10 periods.
+    fn alternates(planes: [TouchPlane; 2], turns: bool) -> [f64; 2] {
+        let lever = if turns { 0.02 } else { 0.0 };
+        let ball = TouchBall { radius: 0.01, stiffness: 500.0, relaxation: 0.0, lever };
+        let mut model = LocalModel { ball, interval: 0.01, plane_count: 1, ..LocalModel::default() };
+        let (mut touch, mut tool) = (Touch::default(), Tool::new(ToolMap::default()));
+        let (mut last, mut change, mut most) = (Vector3::zeros(), 0.0f64, 0.0f64);
+        for tick in 0..400 {
+            model.tick = 1 + tick / 10;
+            model.planes[0] = planes[model.tick as usize % 2];
+            let at = Vector3::new(1e-5 * tick as f64, 0.01 - 1e-5 * (tick as f64).min(300.0), 0.0);
+            tool.update(at, Vector3::zeros(), UnitQuaternion::identity(), 0, false);
+            let now = touch.forces(1e-3 * tick as f64, 1e-3, &tool, &model).elastic;
+            (change, most) = (change.max((now - last).norm()), most.max(now.norm()));
+            last = now;
+        }
+        [change, most]
+    }
+
+    /// A surface that is four times as soft in each second update and turned by half a right angle,
+    /// and one that touches each end of a tool in turn.
+    #[test]
+    fn another_plane_takes_an_update_to_take_over() {
+        let soft = |give: f64| [[give, 0.0, 0.0], [0.0, give, 0.0], [0.0, 0.0, give]];
+        let (sin, cos) = std::f64::consts::FRAC_PI_4.sin_cos();
+        let [from, to] = [([0.0, 1.0, 0.0], 1e-3), ([sin, cos, 0.0], 4e-3)]
+            .map(|(normal, give)| TouchPlane { normal, compliance: soft(give), ..TouchPlane::default() });
+        let ends = [-0.02, 0.02].map(|x| TouchPlane { spot: [x, 0.0, 0.0], ..from });
+        for friction in [0.0, 0.5] {
+            for (planes, turns) in [([from, to], false), (ends, true)] {
+                let planes = planes.map(|plane| TouchPlane { friction, ..plane });
+                let [change, most] = alternates(planes, turns);
+                assert!(most > 0.3 && change < 0.2 * most, "{change} N of {most} N, friction {friction}");
+            }
         }
     }
 
