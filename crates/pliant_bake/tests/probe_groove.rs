@@ -276,19 +276,20 @@ fn a_hull_rests_in_a_groove() {
     });
 }
 
-/// A hand that leads a tool over a groove, into both faces of it and out again, on a closed way,
-/// has given energy.
+/// A hand that leads a tool from free air into both faces of a groove, over them in rounds, and out
+/// again has given energy, on the whole way and in each round but the first, which begins at rest.
 #[test]
 fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
     let soft = model(&grooved(STEEP), 5e4, Some("y<0.001"));
     let across = [[-0.02, 0.0, 0.0], [0.02, 0.0, 0.0]];
     let hull = [[0.0; 3], [0.01, 0.03, 0.01], [-0.01, 0.03, 0.01], [0.0, 0.03, -0.01]];
-    // With the height above a ball that touches both faces at which they touch, m. The capsule that
-    // lies across gives energy where it goes 2 cm deeper (docs/contact.md).
-    let tools: [(&str, &[[f64; 3]], f64); 4] = [
+    // With the height above a ball that touches both faces around which the rounds lead, m. The
+    // capsule that lies across touches 2 cm above it, and is also pressed that deep.
+    let tools: [(&str, &[[f64; 3]], f64); 5] = [
         ("ball", &[[0.0; 3]], 0.0),
         ("capsule along", &ALONG, 0.0),
         ("capsule across", &across, 0.02),
+        ("capsule across, deep", &across, 0.0),
         ("hull", &hull, 0.0),
     ];
     let all = [60.0, 1000.0].into_iter().flat_map(|rate| tools.map(|tool| (rate, tool)));
@@ -296,32 +297,50 @@ fn a_hand_on_a_closed_way_through_a_groove_gives_energy() {
         for friction in [0.0, 0.5] {
             let mut bodies = [body(&soft, rate)];
             let start = STEEP.touching() + Vector3::new(0.0, height, 0.0);
-            let mut probes = [probe(RADIUS, start + Vector3::new(0.0, 0.01, 0.0))];
+            let round = |t: f64| {
+                let turn = std::f64::consts::TAU * t / 2.0;
+                start
+                    + Vector3::new(0.012 * turn.sin(), 0.003 + 0.007 * turn.cos(), 0.01 * (2.0 * turn).sin())
+            };
+            // Down for half a second, four rounds of two seconds, and up again.
+            let way = |t: f64| {
+                let out = (0.5 - t).max(t - 8.5).max(0.0);
+                round(t.clamp(0.5, 8.5) - 0.5) + Vector3::new(0.0, 0.08 * out, 0.0)
+            };
+            let mut probes = [probe(RADIUS, way(0.0))];
             probes[0].configure(ProbeConfig { friction, ..*probes[0].config() }).unwrap();
             probes[0].set_corners(corners).unwrap();
             let mut islands = Islands::default();
-            let (mut given, mut most, mut last) = (0.0, 0.0f64, None::<Vector3<f64>>);
+            let (mut given, mut most, mut last) = (0.0, 0.0f64, way(0.0));
+            // What was given at the ends of the rounds.
+            let mut rounds = Vec::new();
             let mut guarded = 0;
-            for k in 0..=(8.0 * rate) as usize {
-                let t = std::f64::consts::TAU * k as f64 / (2.0 * rate);
-                let way = Vector3::new(0.012 * t.sin(), 0.003 + 0.007 * t.cos(), 0.01 * (2.0 * t).sin());
-                let to = start + way;
+            for k in 0..=(9.0 * rate) as usize {
+                let t = k as f64 / rate;
+                let to = way(t);
                 probes[0].set_target(to.into()).unwrap();
                 step(&mut islands, &mut bodies, &mut probes, rate);
                 guarded += usize::from(bodies[0].contacts().report().guarded);
                 let f = force(&probes[0]);
-                most = most.max(f.norm());
-                if let Some(from) = last {
-                    given -= f.dot(&(to - from));
+                if k == 0 {
+                    assert!(f.norm() == 0.0, "{name}: {f} in free air");
                 }
-                last = Some(to);
+                most = most.max(f.norm());
+                given -= f.dot(&(to - last));
+                last = to;
+                if (t - 0.5).rem_euclid(2.0) < 1e-9 {
+                    rounds.push(given);
+                }
                 assert!(bodies[0].energy() < 0.1, "{} J", bodies[0].energy());
             }
+            let each: Vec<f64> = rounds.windows(2).map(|ends| ends[1] - ends[0]).collect();
             println!(
-                "{name} at {rate} Hz, friction {friction}: {given:.5} J in four rounds, {most:.3} N at most, \
-                 {guarded} guarded"
+                "{name} at {rate} Hz, friction {friction}: {given:.5} J, in the rounds {each:.5?} J, {most:.3} N \
+                 at most, {guarded} guarded"
             );
+            assert!(force(&probes[0]).norm() == 0.0, "{name}: free air is free");
             assert!(given > 0.0 && most > 0.5, "{name}: {given} {most}");
+            assert!(each.len() == 4 && each[1..].iter().all(|each| *each > 0.0), "{name}: {each:?}");
         }
     }
 }
