@@ -489,25 +489,26 @@ impl Probe {
 
     /// The place of the probe that is nearest to a surface, from `spot` on and no farther than
     /// `most` (m), with the probe as it is at the beginning of the step or at its end. `look`
-    /// returns the outward normal of the surface that is nearest to a point (m, world axes), if any
-    /// is near.
+    /// returns the distance (m) and the outward normal of the surface that is nearest to a point (m,
+    /// world axes), if any is near.
     ///
     /// A step leads towards the corner that lies lowest along the normal, to where the distance
-    /// grows again.
+    /// grows again. Where that corner is farther from the surface and the distance falls there, it
+    /// is on the way to something else, and what is near is before it.
     pub(crate) fn slide(
         &self,
         spot: &Vector3<f64>,
         most: f64,
         is_ended: bool,
-        mut look: impl FnMut(&Vector3<f64>) -> Result<Option<Vector3<f64>>, StepError>,
+        mut look: impl FnMut(&Vector3<f64>) -> Result<Option<(f64, Vector3<f64>)>, StepError>,
     ) -> Result<Vector3<f64>, StepError> {
         let turn = if is_ended { self.rotation } else { self.start_rotation };
         let mut look = |spot: &Vector3<f64>| {
             let point = if is_ended { self.ended(spot) } else { self.begun(spot) };
-            Ok::<_, StepError>(look(&point)?.map(|normal| turn.inverse() * normal))
+            Ok::<_, StepError>(look(&point)?.map(|(distance, normal)| (distance, turn.inverse() * normal)))
         };
         let (mut at, mut left) = (*spot, most);
-        let Some(mut normal) = look(&at)? else { return Ok(at) };
+        let Some((mut distance, mut normal)) = look(&at)? else { return Ok(at) };
         for _ in 0..SLIDES {
             let lowest = self.corners().iter().min_by(|a, b| normal.dot(a).total_cmp(&normal.dot(b)));
             let Some(mut way) = lowest.map(|lowest| lowest - at) else { break };
@@ -519,20 +520,23 @@ impl Probe {
             }
             way *= (left / way.norm()).min(1.0);
             let mut there = look(&(at + way))?;
-            while there.is_none() && way.norm() > SAME * self.config.radius {
+            let is_beyond = |there: &Option<(f64, Vector3<f64>)>, way: &Vector3<f64>| {
+                there.is_none_or(|(farther, next)| farther > distance && next.dot(way) <= 0.0)
+            };
+            while is_beyond(&there, &way) && way.norm() > SAME * self.config.radius {
                 way *= 0.5;
                 there = look(&(at + way))?;
             }
-            let Some(mut next) = there else { break };
+            let Some((mut least, mut next)) = there else { break };
             let (slope, rises) = (normal.dot(&way), next.dot(&way));
             if rises > 0.0 {
                 way *= slope / (slope - rises);
                 let Some(found) = look(&(at + way))? else { break };
-                next = found;
+                (least, next) = found;
             }
             at += way;
             left -= way.norm();
-            normal = next;
+            (distance, normal) = (least, next);
         }
         Ok(at)
     }

@@ -182,6 +182,20 @@ impl Shape<'_> {
         self.near(place, &moved, &gradient, point)
     }
 
+    /// As [`Shape::at`], but beside an edge or a corner the normal leads to the point.
+    pub(crate) fn beside(&self, place: &Place, point: &Vector3<f64>) -> Near {
+        self.beyond(self.at(place, point), point)
+    }
+
+    /// Beside an edge or a corner where the surface is not smooth, no face looks at the point, and
+    /// the nearest place is as far as the way to it.
+    fn beyond(&self, near: Near, point: &Vector3<f64>) -> Near {
+        let way = point - near.at;
+        let (length, above) = (way.norm(), near.normal.dot(&way));
+        let sharp = above > 0.0 && (above < SMOOTH * length || self.field.is_sharp(&near.place));
+        if sharp { Near { normal: way / length, distance: length, ..near } } else { near }
+    }
+
     fn near(
         &self,
         place: &Place,
@@ -318,10 +332,7 @@ impl Shape<'_> {
             let (next, moved, gradient) = pulled(&place)?;
             if (next - x).norm() <= still || round + 1 == ROUNDS {
                 let near = self.near(&place, &moved, &gradient, point);
-                let way = point - near.at;
-                let length = way.norm();
-                let sharp = near.normal.dot(&way) < SMOOTH * length && near.normal.dot(&way) > 0.0;
-                let near = if sharp { Near { normal: way / length, distance: length, ..near } } else { near };
+                let near = self.beyond(near, point);
                 return (near.distance.abs() <= within && fits(&near)).then_some(near);
             }
             (x, wanted) = (next, rest(&gradient));

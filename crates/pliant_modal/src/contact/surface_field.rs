@@ -31,6 +31,9 @@ struct Facet {
     normal: Vector3<f64>,
     /// Normals of the smooth surface at the corners.
     smooth: [Vector3<f64>; 3],
+    /// Whether a triangle at the corner has another smooth surface, and one beyond the edge from
+    /// there to the next corner.
+    sharp: [[bool; 2]; 3],
 }
 
 /// A box around triangles. A leaf has triangles from `first`, another node two children, the first
@@ -437,6 +440,20 @@ impl SurfaceField {
         let weights = closest_on_triangle(facet.corners.map(|v| &self.vertices[v as usize]), point);
         let place = Place { facet: place.facet, weights };
         Some((place, (point - self.rest(&place)).norm()))
+    }
+
+    /// Whether a place lies on an edge or at a corner where the surface is not smooth.
+    pub(crate) fn is_sharp(&self, place: &Place) -> bool {
+        let sharp = &self.facets[place.facet as usize].sharp;
+        match place.weights.map(|weight| weight == 0.0) {
+            [false, true, true] => sharp[0][0],
+            [true, false, true] => sharp[1][0],
+            [true, true, false] => sharp[2][0],
+            [false, false, true] => sharp[0][1],
+            [true, false, false] => sharp[1][1],
+            [false, true, false] => sharp[2][1],
+            _ => false,
+        }
     }
 
     /// The corners of the triangle of a place, m, body axes.

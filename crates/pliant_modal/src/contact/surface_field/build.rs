@@ -34,7 +34,7 @@ impl SurfaceField {
             // A triangle without area has no normal, and others are as near.
             if area > 0.0 {
                 let normal = across / area;
-                facets.push(Facet { corners, normal, smooth: [normal; 3] });
+                facets.push(Facet { corners, normal, smooth: [normal; 3], sharp: [[false; 2]; 3] });
             }
         }
         smoothen(&vertices, &mut facets);
@@ -103,7 +103,7 @@ impl SurfaceField {
 }
 
 /// Gives the corners of all triangles the mean normals of the triangles around them that meet at
-/// small angles.
+/// small angles, and tells which corners and edges have others.
 fn smoothen(vertices: &[Vector3<f64>], facets: &mut [Facet]) {
     let mut around: Vec<Vec<u32>> = vec![Vec::new(); vertices.len()];
     for (index, facet) in facets.iter().enumerate() {
@@ -127,6 +127,13 @@ fn smoothen(vertices: &[Vector3<f64>], facets: &mut [Facet]) {
                 }
             }
             sum.try_normalize(1e-9).unwrap_or(own)
+        });
+        facets[index].sharp = [0, 1, 2].map(|k| {
+            let (from, to) = (corners[k], corners[(k + 1) % 3]);
+            let others = around[from as usize].iter().map(|&other| &facets[other as usize]);
+            let mut others = others.filter(|other| other.normal.dot(&own) <= SMOOTH);
+            let beyond = others.clone().any(|other| other.corners.contains(&to));
+            [others.next().is_some(), beyond]
         });
     }
 }

@@ -107,7 +107,7 @@ pub(in super::super) fn begin_probes<P: Member>(
             match memory.other {
                 Touched::Obstacle(at) => {
                     let Some(obstacle) = probe.obstacles().get(at) else { continue };
-                    let spot = slide(probe, &memory.spot, false, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
+                    let spot = slide(probe, &memory.spot, false, |x| Ok(Some(ground(&**obstacle, x)?)))?;
                     if is_taken(work, |point, _| is_at_obstacle(point, span, at), &spot, radius) {
                         continue;
                     }
@@ -130,11 +130,11 @@ pub(in super::super) fn begin_probes<P: Member>(
                     let within = reach(radius, shape.size);
                     let mut hint = place;
                     let spot = slide(probe, &memory.spot, false, |x| {
-                        Ok(normal_of(shape.nearest(x, within, Some(&hint)), &mut hint))
+                        Ok(found_of(shape.nearest(x, within, Some(&hint)), &mut hint))
                     })?;
                     let center = probe.begun(&spot.at);
                     let near = on_side((probe, &spot, &memory.plane), &shape, &center, within, Some(&place));
-                    let near = near.unwrap_or_else(|| shape.at(&place, &center));
+                    let near = near.unwrap_or_else(|| shape.beside(&place, &center));
                     let plane = plane_of(&near, &center);
                     let same = |point: &ContactPoint, at: &AtProbe| {
                         is_at_body(point, at, member, index) && !is_groove(probe, &spot, &plane, &at.plane)
@@ -158,12 +158,18 @@ pub(in super::super) fn begin_probes<P: Member>(
     Ok(())
 }
 
-/// The normal of what was found, whose place the next search begins with.
-fn normal_of(near: Option<Near>, hint: &mut Place) -> Option<Vector3<f64>> {
+/// The distance and the normal of what was found, whose place the next search begins with.
+fn found_of(near: Option<Near>, hint: &mut Place) -> Option<(f64, Vector3<f64>)> {
     near.map(|near| {
         *hint = near.place;
-        near.normal
+        (near.distance, near.normal)
     })
+}
+
+/// The distance and the normal of an obstacle.
+fn ground(obstacle: &dyn ObstacleShape, point: &Vector3<f64>) -> Result<(f64, Vector3<f64>), StepError> {
+    let found = look(obstacle, point)?;
+    Ok((found.distance, found.normal))
 }
 
 fn is_at_obstacle(point: &ContactPoint, span: usize, obstacle: usize) -> bool {
@@ -180,7 +186,7 @@ fn slide(
     probe: &Probe,
     spot: &Spot,
     is_ended: bool,
-    look: impl FnMut(&Vector3<f64>) -> Result<Option<Vector3<f64>>, StepError>,
+    look: impl FnMut(&Vector3<f64>) -> Result<Option<(f64, Vector3<f64>)>, StepError>,
 ) -> Result<Spot, StepError> {
     match spot.fixed {
         Some(_) => Ok(*spot),
@@ -381,7 +387,7 @@ fn detect_at_obstacle<P: Member>(
     // What is rigid needs no places between but the one that is nearest.
     if let Some((mut found, passed, Spot { at: mut place, .. })) = nearest {
         if !passed {
-            place = probe.slide(&place, f64::INFINITY, true, |x| Ok(Some(look(obstacle, x)?.normal)))?;
+            place = probe.slide(&place, f64::INFINITY, true, |x| Ok(Some(ground(obstacle, x)?)))?;
             found = look(&grown, &probe.ended(&place))?;
         }
         let spot = Spot { at: place, fixed: None };
@@ -415,14 +421,14 @@ fn detect_at_body<P: Member>(
             .then(|| end.sweep(&start.pull_back(&from), &end.pull_back(&to), radius))
             .flatten();
         match &swept {
-            Some(place) => Some((end.at(place, &to), true)),
+            Some(place) => Some((end.beside(place, &to), true)),
             None => Some((end.nearest(&to, within, None)?, false)),
         }
     };
     let mut penetrates = false;
     let mut add = |work: &mut Touching, spot: Spot, near: &Near, passed: bool| {
         let from = probe.begun(&spot.at);
-        let begun = start.at(&near.place, &from);
+        let begun = start.beside(&near.place, &from);
         let mut point = at_body(&view, &start, member, &near.place, (probe, (index, span), spot), &begun);
         point.gap = begun.distance - radius;
         point.passed = passed;
@@ -464,7 +470,7 @@ fn detect_at_body<P: Member>(
         if !passed {
             let mut hint = near.place;
             place = probe.slide(&place, f64::INFINITY, true, |x| {
-                Ok(normal_of(end.nearest(x, within, Some(&hint)), &mut hint))
+                Ok(found_of(end.nearest(x, within, Some(&hint)), &mut hint))
             })?;
             near = end.nearest(&probe.ended(&place), within, Some(&hint)).unwrap_or(near);
         }

@@ -6,7 +6,7 @@ use super::super::super::{
     group::{Group, Member},
     touch::look,
 };
-use super::{RECOVERY_SPEED, compliance, floor, is_far, normal_of, on_side, plane_of, reach, slide};
+use super::{RECOVERY_SPEED, compliance, floor, found_of, ground, is_far, on_side, plane_of, reach, slide};
 use crate::{
     Probe, ProbeContact, StepError,
     contact::{ContactPoint, ProbeMemory, Touched, Touching},
@@ -28,7 +28,7 @@ pub(in super::super) fn linearize_at_probe<P: Member>(
             let Touched::Obstacle(index) = point.other else { return Ok(()) };
             let Some(obstacle) = probe.obstacles().get(index) else { return Ok(()) };
             if !far {
-                at.nearest = slide(probe, &at.spot, true, |x| Ok(Some(look(&**obstacle, x)?.normal)))?;
+                at.nearest = slide(probe, &at.spot, true, |x| Ok(Some(ground(&**obstacle, x)?)))?;
             }
             let x = probe.ended(&at.nearest.at);
             if !far {
@@ -49,7 +49,7 @@ pub(in super::super) fn linearize_at_probe<P: Member>(
             let within = reach(radius, shape.size);
             if !far {
                 at.nearest = slide(probe, &at.spot, true, |x| {
-                    Ok(normal_of(shape.nearest(x, within, Some(&last)), &mut last))
+                    Ok(found_of(shape.nearest(x, within, Some(&last)), &mut last))
                 })?;
             }
             let x = probe.ended(&at.nearest.at);
@@ -58,7 +58,7 @@ pub(in super::super) fn linearize_at_probe<P: Member>(
             } else {
                 on_side((probe, &at.spot, &at.plane), &shape, &x, within, Some(&last))
             };
-            let near = near.unwrap_or_else(|| shape.at(&last, &x));
+            let near = near.unwrap_or_else(|| shape.beside(&last, &x));
             (at.last, at.plane) = (Some(near.place), plane_of(&near, &x));
             let (end, tangent): (_, Tangent) = shape.material(place, carriers);
             point.end = end;
