@@ -4,6 +4,7 @@
 pub mod baked;
 pub mod block;
 pub mod machine;
+pub mod rod;
 pub mod scene;
 pub mod valley;
 pub mod world;

@@ -1,9 +1,9 @@
 //! A block with a valley of 90 degrees in its top. Its modes are those of a rod that stands on its
-//! fixed bottom, as for [`super::block`].
+//! fixed bottom.
 
-use std::f64::consts::FRAC_PI_2;
+use pliant_modal::{FlexibilitySite, ModalModel};
 
-use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, SurfaceMesh};
+use super::rod::{DENSITY, Rod};
 
 /// Height of the valley above the ground, m.
 pub const VALLEY: f64 = 0.03;
@@ -11,7 +11,6 @@ pub const VALLEY: f64 = 0.03;
 const HALF: f64 = 0.05;
 /// Distance of the vertices of the faces, m.
 const SPACING: f64 = 0.005;
-const DENSITY: f64 = 1000.0;
 
 /// Outlines of the block from one end of the valley to the other, beginning in the middle of the
 /// bottom.
@@ -46,21 +45,6 @@ pub fn valley(young: f64) -> ModalModel {
     }
     let height = VALLEY + 0.5 * HALF;
     let mass = DENSITY * height * (2.0 * HALF).powi(2);
-    let wave = |k: usize| (2 * k + 1) as f64 * FRAC_PI_2 / height;
-    let size = (2.0 / mass).sqrt();
-    let (mut omega, mut displacement, mut participation) = (Vec::new(), Vec::new(), Vec::new());
-    for (k, axis) in (0..3).flat_map(|k| (0..3).map(move |axis| (k, axis))) {
-        omega.push(wave(k) * (young / DENSITY).sqrt());
-        for p in &positions {
-            let mut row = [0.0f32; 3];
-            row[axis] = (size * (wave(k) * f64::from(p[1]).min(height)).sin()) as f32;
-            displacement.extend(row);
-        }
-        let mut part = [0.0; 3];
-        part[axis] = size * mass / (wave(k) * height);
-        participation.push(part);
-    }
-    let zeta = 0.3;
     // A punch of the radius of a site on a half-space.
     let dent = 0.91 / (2.0 * young * 0.5 * SPACING) * 0.5;
     let flexibility = std::array::from_fn(|i| std::array::from_fn(|j| if i == j { dent } else { 0.0 }));
@@ -68,34 +52,15 @@ pub fn valley(young: f64) -> ModalModel {
     let sites =
         free.map(|(vertex, _)| FlexibilitySite { vertex: vertex as u32, radius: SPACING, flexibility });
     let sites = sites.collect();
-    let anchored = positions.iter().map(|p| p[1] == 0.0).collect();
-    let inertia = mass * HALF * HALF / 3.0;
-    ModalModel::from_parts(ModelParts {
-        info: BakeInfo {
-            name: "valley".into(),
-            tets: 0,
-            nodes: 0,
-            element: Element::Tet10,
-            young,
-            poisson: 0.3,
-            density: DENSITY,
-            damping: Damping::Ratio(zeta),
-            anchors: vec!["y<=0".into()],
-            residual_max: 0.0,
-            orthonormality_max: 0.0,
-        },
-        surface: SurfaceMesh::new(positions, triangles, None, anchored).unwrap(),
-        damping: omega.iter().map(|w| 2.0 * zeta * w).collect(),
-        rotation: vec![0.0; displacement.len()],
-        displacement,
-        omega,
-        participation,
-        free: false,
+    let rod = Rod {
+        name: "valley",
+        along: 1,
+        length: height,
         mass,
-        center_of_mass: [0.0, 0.5 * height, 0.0],
-        inertia: [[inertia, 0.0, 0.0], [0.0, inertia, 0.0], [0.0, 0.0, inertia]],
-        sites,
-        reduced: None,
-    })
-    .unwrap()
+        young,
+        each: 3,
+        zeta: 0.3,
+        inertia: mass * HALF * HALF / 3.0,
+    };
+    rod.model(positions, triangles, sites)
 }

@@ -18,7 +18,7 @@ pub struct World {
     writer: ModelWriter,
     pub cycle: Cycle<VirtualDevice>,
     hand: VirtualHandle,
-    scheduler: VirtualScheduler,
+    pub scheduler: VirtualScheduler,
     pub model: LocalModel,
     events: Vec<LoopEvent>,
     step: f64,
