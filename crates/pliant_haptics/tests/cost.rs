@@ -9,13 +9,18 @@ use std::{
     alloc::{GlobalAlloc, Layout, System},
     cell::Cell,
     hint::black_box,
+    sync::Arc,
     time::Duration,
 };
 
-use pliant_haptics::{HandModel, HapticLoop, Histogram, LoopEvent, LoopState, VirtualConfig, VirtualDevice};
+use pliant_haptics::{
+    HandModel, HapticLoop, Histogram, LoopEvent, LoopState, MAX_PLANES, VirtualConfig, VirtualDevice,
+};
 use rig::{
     machine,
     scene::{Scene, SceneConfig},
+    valley::{VALLEY, valley},
+    world::{DOWN, RADIUS, UP, World},
 };
 
 struct Counting;
@@ -136,6 +141,45 @@ fn the_loop_allocates_nothing_and_takes_as_long_as_twenty_thousand_multiplicatio
 fn the_modal_loop_allocates_nothing_and_takes_as_long_as_sixty_thousand() {
     let work = work(true);
     assert!(work <= 6.0, "{work} times ten thousand multiplications and additions");
+}
+
+/// The edge of a box in a valley, with as many planes as the loop has room for.
+#[test]
+fn a_loop_that_touches_sixteen_planes_allocates_nothing() {
+    let corners: Vec<[f64; 3]> = (0..8)
+        .map(|n| [[0.0, 0.0], [0.01, 0.01], [-0.01, 0.01], [0.0, 0.02]][n % 4])
+        .zip([-0.01; 4].into_iter().chain([0.01; 4]))
+        .map(|([x, y], z)| [x, y, z])
+        .collect();
+    let at = [0.0, VALLEY + RADIUS * (2f64.sqrt() - 1.0), 0.0];
+    let (model, hand) = (Arc::new(valley(2e4)), HandModel::LIGHT);
+    let mut world = World::above(at, Some(model), 60.0, VirtualConfig::touch(), hand);
+    world.probe.set_corners(&corners).unwrap();
+    world.lead(UP, DOWN, 0.5, |_| {});
+    world.lead(DOWN, DOWN, 0.5, |_| {});
+    let mut local = world.model.clone();
+    assert_eq!(local.planes().len(), MAX_PLANES);
+    let mut events: Vec<LoopEvent> = Vec::with_capacity(1024);
+    let (mut work, mut yardstick) = (Histogram::default(), f64::INFINITY);
+    let before = ALLOCATIONS.with(Cell::get);
+    for k in 0..PERIODS {
+        if k % 16 == 0 {
+            local.tick += 1;
+            local.stamp = world.scheduler.now();
+        }
+        let begun = cpu_time();
+        world.cycle.step(&mut world.scheduler, &local, &mut events);
+        work.add(cpu_time() - begun);
+        if k % 100 == 0 {
+            let begun = cpu_time();
+            multiply_and_add();
+            yardstick = yardstick.min(cpu_time() - begun);
+        }
+    }
+    assert_eq!(ALLOCATIONS.with(Cell::get) - before, 0);
+    assert!(world.force()[1] > 0.1, "{:?}", world.force());
+    let [half, most] = [0.5, 0.99].map(|share| 1e6 * work.percentile(share));
+    println!("16 planes: p50 {half:.1} us, p99 {most:.1} us; yardstick {:.1} us", yardstick * 1e6);
 }
 
 #[test]
