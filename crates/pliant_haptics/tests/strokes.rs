@@ -67,7 +67,7 @@ fn a_thin_capsule_strokes_an_ear_without_a_kick() {
     assert!(kicks.is_empty(), "{} of {rows} ways:\n{}", kicks.len(), kicks.join("\n"));
 }
 
-/// Above the tip of a horn, whose faces meet there at more than a right angle, a capsule feels the
+/// Above the tip of a horn, whose faces meet there at nearly right angles, a capsule feels the
 /// tip from where it touches it, and the force grows with the way.
 #[test]
 fn a_capsule_comes_down_on_a_tip() {
