@@ -197,9 +197,9 @@ fn a_body_is_timed_against_the_memory() {
     let speed = told["bandwidth_gb_s"].as_f64().unwrap();
     let expected = told["bytes"].as_f64().unwrap() / median(&told, "reconstruct_us") * 1e-3;
     assert!((speed / expected - 1.0).abs() < 1e-9, "{speed} GB/s instead of {expected}");
-    // No surface is faster than the limit of the memory. That it is the fastest of sums and surfaces
-    // and that a frame is a step and a surface is tried on a clock of their own (bench.rs of
-    // pliant_lab): a core may change its speed between two timings.
+    // No surface is faster than the limit of the memory. That it is the fastest of sums and
+    // surfaces and that a frame is a step and a surface is tried on a clock of their own (bench.rs
+    // of pliant_lab): a core may change its speed between two timings.
     let limit = told["bandwidth_limit_gb_s"].as_f64().unwrap();
     assert!(speed <= limit, "{told}");
     assert!(median(&told, "reconstruct_us") < median(&told, "frame_us"), "{told}");

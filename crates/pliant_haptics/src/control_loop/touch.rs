@@ -153,9 +153,9 @@ impl Touch {
     /// Takes the planes of a new update. Each force is at first what it was, and goes from there to
     /// what the update has. A plane that goes on with the force of an old one begins where it gives
     /// this force, and turned as the old one: its dent may be several times as soft or as stiff,
-    /// since a place shares its site with others that come and go. A plane in which the tool already
-    /// is begins at the tool, without force. One that is touched and that the update has no more
-    /// pushes less and less.
+    /// since a place shares its site with others that come and go. A plane in which the tool
+    /// already is begins at the tool, without force. One that is touched and that the update has no
+    /// more pushes less and less.
     fn take(&mut self, now: f64, model: &LocalModel, held: &Held) {
         let (old, known) = (self.slots, self.count);
         (self.tick, self.since) = (model.tick, now);

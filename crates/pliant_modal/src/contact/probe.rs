@@ -489,8 +489,8 @@ impl Probe {
 
     /// The place of the probe that is nearest to a surface, from `spot` on and no farther than
     /// `most` (m), with the probe as it is at the beginning of the step or at its end. `look`
-    /// returns the distance (m) and the outward normal of the surface that is nearest to a point (m,
-    /// world axes), if any is near.
+    /// returns the distance (m) and the outward normal of the surface that is nearest to a point
+    /// (m, world axes), if any is near.
     ///
     /// A step leads towards the corner that lies lowest along the normal, to where the distance
     /// grows again. Where that corner is farther from the surface and the distance falls there, it
