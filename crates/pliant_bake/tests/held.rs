@@ -467,7 +467,7 @@ fn shapes_that_replace_others_leave_the_motion_as_it_is() {
 }
 
 #[test]
-fn a_body_of_which_one_of_two_hands_lets_go_gains_little_and_only_with_its_new_shapes() {
+fn a_body_of_which_one_of_two_hands_lets_go_gains_nothing() {
     let free = BakeConfig { anchors: Vec::new(), ..config() };
     let models = [model(&slender(), &config()), model(&slender(), &free)];
     // Whether the body is free, places and ways of the hand that stays and of the one that goes.
@@ -499,21 +499,32 @@ fn a_body_of_which_one_of_two_hands_lets_go_gains_little_and_only_with_its_new_s
             let before = stored(&body);
             body.release(grabs[1].0);
             let mut most = stored(&body);
-            let mut at_once = 0.0;
-            for i in 0..(3.0 * rate) as usize {
+            for _ in 0..(3.0 * rate) as usize {
                 body.make_held_shapes().unwrap();
-                if i == 0 {
-                    at_once = stored(&body);
-                }
                 most = most.max(stored(&body));
                 body.step().unwrap();
                 most = most.max(stored(&body));
             }
-            println!(
-                "{name} at {rate} Hz: {before:.4} J, with new shapes {at_once:.4}, then at most {most:.4}"
-            );
-            assert!(at_once < 1.2 * before, "{name}: {before} J, with new shapes {at_once}");
-            assert!(most < 1.001 * before.max(at_once), "{name}: {before} J, {at_once}, then {most}");
+            println!("{name} at {rate} Hz: {before:.4} J, then at most {most:.4}");
+            assert!(most < 1.001 * before, "{name}: {before} J, then {most}");
+            // The hand that stays leads on until it gets shapes of its own.
+            let start = body.target(grabs[0].0).unwrap();
+            let mut ends = None;
+            for i in 1..=120 {
+                let share = f64::from(i) / 120.0;
+                let target = std::array::from_fn(|k| start[k] - 0.5 * share * ways[0][k]);
+                body.set_target(grabs[0].0, target).unwrap();
+                let old = body.energy();
+                if body.make_held_shapes().unwrap() {
+                    ends = Some((old, body.energy()));
+                    break;
+                }
+                body.step().unwrap();
+            }
+            let (old, new) = ends.unwrap();
+            println!("{name}: {old:.4} J with the shapes of both, {new:.4} with its own");
+            assert!(body.held_shapes().unwrap().places().len() == 1);
+            assert!(new <= old * (1.0 + 1e-9), "{name}: {old} J with the shapes of both, then {new}");
         }
     }
 }
@@ -536,8 +547,8 @@ fn a_plate_gives_way_beyond_the_shapes_of_the_patch_too() {
     }
 }
 
-/// When another hand takes hold, both get shapes of another kind. What the first one feels goes
-/// over to the new force within a second, and not at once.
+/// When another hand takes hold, both get shapes of another kind. What the first one feels stays
+/// within two hundredths, without a kick on the way.
 #[test]
 fn a_hand_feels_no_kick_when_another_takes_hold_or_lets_go() {
     let model = model(&shapes::bar([10, 10, 2], [1.0, 1.0, 0.15]).unwrap(), &config());
@@ -558,8 +569,8 @@ fn a_hand_feels_no_kick_when_another_takes_hold_or_lets_go() {
         }
         let settled = norm(minus(last, before)) / whole;
         println!("{what}: {:.2} % a step, {:.2} % in the end", 100.0 * most / whole, 100.0 * settled);
-        assert!(settled > 0.02, "{what}: too little changes to see a kick");
-        assert!(most / whole < 0.25 * settled + 0.002, "{what}: {most} of {whole} N");
+        assert!(settled < 0.02, "{what}: {settled}");
+        assert!(most / whole < 0.0075, "{what}: {most} of {whole} N");
     };
     let other = body.grab(&patch([0.5, 0.0, 0.15]), GrabConfig::default()).unwrap();
     rest(&mut body, "another takes hold");

@@ -79,11 +79,15 @@ impl Body {
         self.kernel.held_shapes()
     }
 
-    /// The patches that are held and where they are, oldest first.
+    /// The patches that are held and where they are, oldest first. Where a hand still comes back
+    /// from the place that other shapes put it to ([`Body::set_held_shapes`]), it is taken for back:
+    /// shapes for the place on the way would put it elsewhere again.
     pub fn held_places(&self) -> impl ExactSizeIterator<Item = HeldPlace> + Clone + '_ {
-        self.hands.iter().map(|hand| {
+        let back = self.state.frame.rotation().inverse();
+        self.hands.iter().zip(&self.grabs).map(move |(hand, grab)| {
             let (vertex, radius) = hand.patch.center_and_radius();
-            HeldPlace { vertex, radius, displacement: self.patch_displacement(&hand.patch).into() }
+            let displacement = self.patch_displacement(&hand.patch) - back * grab.slip;
+            HeldPlace { vertex, radius, displacement: displacement.into() }
         })
     }
 
@@ -114,10 +118,10 @@ impl Body {
             return Ok(false);
         }
         let shapes = HeldShapes::of_places(self.model(), &places)?.map(Arc::new);
-        // Of the same patches, the old ones are better than none.
-        let patch = |place: HeldPlace| (place.vertex, place.radius.to_bits());
-        let same = |own: &Arc<HeldShapes>| own.places().map(patch).eq(places.iter().copied().map(patch));
-        let changes = shapes.is_some() || self.held_shapes().is_some_and(|own| !same(own));
+        // Of the same patches and of more, the old ones are better than none.
+        let is_of = |own: &HeldShapes, place: &HeldPlace| own.places().any(|made| made.key() == place.key());
+        let serve = |own: &Arc<HeldShapes>| places.iter().all(|place| is_of(own, place));
+        let changes = shapes.is_some() || self.held_shapes().is_some_and(|own| !serve(own));
         if shapes.is_none() {
             self.without = places;
         }

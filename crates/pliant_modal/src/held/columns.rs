@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, Vector3};
 
 use super::{
+    HeldShapes,
     region::{NodeLoad, Region},
     thinned,
 };
@@ -33,26 +34,60 @@ const BESIDE: [f64; 2] = [0.25, 0.04];
 /// Largest energy density of a shape beside, as a share of Young's modulus.
 const ENERGY: f64 = 0.02;
 
-/// Maximum number of times that shapes on the paths of hands are corrected, and those around hands
-/// that are at rest. With fewer or more there, a free bar that was then torn by 70 % swung more and
-/// more.
-const CORRECTIONS: usize = 6;
-const AT_REST: usize = 3;
+/// How shapes on the paths of hands are corrected, and what is kept of them.
+pub(super) struct Effort {
+    /// Maximum number of times that shapes are corrected.
+    corrections: usize,
+    /// Share of its energy by which the shape at the ends of the paths is corrected at which
+    /// corrections end.
+    enough: f64,
+    /// By how much more the correction of that shape counts than those of the others. The stiffness
+    /// is that in it, so that its corrections are the right ones, while those of others can be far
+    /// off.
+    end: f64,
+    /// Number of columns that are kept beside the static ones.
+    kept: usize,
+    /// Largest number of points of the rule, by coordinate.
+    pub(super) points: usize,
+    /// Largest number of points inside the region from which they are chosen.
+    pub(super) candidates: usize,
+}
+
+impl Effort {
+    /// The effort for hands that have led their patches by `displacements` (m).
+    pub(super) fn of(displacements: &[Vector3<f64>]) -> &'static Self {
+        let is_at_rest = displacements.iter().all(|displacement| *displacement == Vector3::zeros());
+        let efforts = if is_at_rest { &AT_REST } else { &EFFORTS };
+        &efforts[displacements.len().clamp(1, efforts.len()) - 1]
+    }
+}
+
+/// By the number of patches. Two hands that shear a bunny converge slowly and need more columns:
+/// they were off by 15 % with a share of 5e-4, and by 9 % with three points by coordinate. With
+/// thirty columns for four hands that twist a bar, the rule follows what the shapes do by chance.
+const EFFORTS: [Effort; HeldShapes::MAX_PATCHES] = [
+    Effort { corrections: 6, enough: 5e-4, end: 1.0, kept: 6, points: 3, candidates: 16_000 },
+    Effort { corrections: 8, enough: 1e-5, end: 3.0, kept: 14, points: 4, candidates: 16_000 },
+    Effort { corrections: 6, enough: 5e-4, end: 1.0, kept: 10, points: 3, candidates: 16_000 },
+    Effort { corrections: 6, enough: 5e-4, end: 1.0, kept: 12, points: 3, candidates: 16_000 },
+];
+
+/// The same around hands that are at rest. With fewer or more corrections there, a free bar that was
+/// then torn by 70 % swung more and more.
+const AT_REST: [Effort; HeldShapes::MAX_PATCHES] = [
+    Effort { corrections: 3, enough: 5e-4, end: 1.0, kept: 6, points: 3, candidates: 4_000 },
+    Effort { corrections: 3, enough: 5e-4, end: 1.0, kept: 8, points: 3, candidates: 4_000 },
+    Effort { corrections: 3, enough: 5e-4, end: 1.0, kept: 10, points: 3, candidates: 4_000 },
+    Effort { corrections: 3, enough: 5e-4, end: 1.0, kept: 12, points: 3, candidates: 4_000 },
+];
 
 /// Number of columns that each time adds.
 const ADDED: usize = 6;
-
-/// Share of its energy by which the shape at the ends of the paths is corrected at which
-/// corrections end.
-const ENOUGH: f64 = 5e-4;
 
 /// Number of points outside of the region that find shapes on the paths of hands. Inside, all
 /// points do: with half of them, the shapes bend where no point is, and pressing hands are off by
 /// 50 %.
 const OUTSIDE: usize = 400;
-
-/// Number of columns that are kept beside the static ones: of one patch, and of each further one.
-const KEPT: [usize; 2] = [6, 2];
 
 /// Number of points from which those are taken.
 const OUTSIDE_ALL: usize = 2_000;
@@ -136,21 +171,20 @@ impl Columns {
         let points = columns.some_points(model, region);
         let mut shapes =
             led(model, law, &columns.omega(model), &points, &columns.rows(region, loads), displacements)?;
-        let is_at_rest = displacements.iter().all(|displacement| *displacement == Vector3::zeros());
-        for _ in 0..if is_at_rest { AT_REST } else { CORRECTIONS } {
-            let new = columns.corrections(model, region, loads, law, &shapes, displacements);
+        let effort = Effort::of(displacements);
+        for _ in 0..effort.corrections {
+            let new = columns.corrections(model, region, loads, law, &shapes, (displacements, effort.end));
             let Some((new, share)) = new else { break };
             shapes = widened(&shapes, columns.width, new.width);
             columns = columns.with(&new);
             let points = columns.some_points(model, region);
             shapes = columns.refined(model, region, loads, law, &points, shapes)?;
-            if share.is_some_and(|share| share <= ENOUGH) {
+            if share.is_some_and(|share| share <= effort.enough) {
                 break;
             }
         }
-        let keep = KEPT[0] + KEPT[1] * (loads.len() - 1);
         let (columns, shapes) =
-            columns.compressed(&columns.rows(region, loads), model.omega(), shapes, keep)?;
+            columns.compressed(&columns.rows(region, loads), model.omega(), shapes, effort.kept)?;
         let points = columns.some_points(model, region);
         let shapes = columns.refined(model, region, loads, law, &points, shapes)?;
         (!shapes.is_empty()).then_some((columns, shapes))
@@ -228,8 +262,9 @@ impl Columns {
 
     /// Makes columns that correct shapes: the displacements by which a Newton step changes them,
     /// less what the columns and the coordinates have of them. Those with the largest shares of the
-    /// energy are kept. Returns them with the share of its energy by which the shape at the ends of
-    /// the paths is corrected, if there is one, and `None` if there are no columns.
+    /// energy are kept, where the shape at the ends of the paths counts `end_counts` times as much.
+    /// Returns them with the share of its energy by which that shape is corrected, if there is one,
+    /// and `None` if there are no columns.
     fn corrections(
         &self,
         model: &ModalModel,
@@ -237,7 +272,7 @@ impl Columns {
         loads: &[NodeLoad],
         law: Hyperelastic,
         shapes: &[GuidedShape],
-        displacements: &[Vector3<f64>],
+        (displacements, end_counts): (&[Vector3<f64>], f64),
     ) -> Option<(Self, Option<f64>)> {
         let (omega, width) = (self.omega(model), shapes.len());
         if width == 0 {
@@ -249,7 +284,11 @@ impl Columns {
         let scales: Vec<f64> = shapes
             .iter()
             .map(|shape| shape.q.iter().zip(&omega).map(|(q, omega)| (q * omega).powi(2)).sum::<f64>())
-            .map(|energy| if energy > 0.0 { 1.0 / energy.sqrt() } else { 0.0 })
+            .enumerate()
+            .map(|(shape, energy)| {
+                let counts = if Some(shape) == end { end_counts } else { 1.0 };
+                if energy > 0.0 { counts / energy.sqrt() } else { 0.0 }
+            })
             .collect();
         for row in values.chunks_exact_mut(width) {
             row.iter_mut().zip(&scales).for_each(|(x, scale)| *x *= scale);
@@ -258,7 +297,7 @@ impl Columns {
             return None;
         }
         let energies = region.energies([&values, &values], [width; 2]);
-        let share = end.map(|end| energies[end * width + end]);
+        let share = end.map(|end| energies[end * width + end] / end_counts.powi(2));
         let corrections = Self { values, width, parts: Vec::new() };
         let columns = corrections.beside(model, region, &energies, CORRECTION, ADDED, Some(self))?;
         Some((columns, share))
@@ -315,6 +354,8 @@ impl Columns {
         let mut parts = combined(&parts, &combine);
         if let (Some(others), Some(shared)) = (others, shared) {
             let theirs = product(&shared, &combine);
+            // The others move nodes beyond the region too.
+            values.resize(others.values.len() / others.width * combine.ncols(), 0.0);
             let take = |from: &mut [f64], rows: &[f64]| {
                 from.iter_mut().zip(combined(rows, &theirs)).for_each(|(x, part)| *x -= part);
             };

@@ -173,7 +173,7 @@ mod tests {
     use super::*;
     use crate::{
         Material,
-        held::stiffness::{Stiffness, field, write},
+        held::stiffness::{MAX_ITERATIONS, Stiffness, field, write},
         simd::widest,
     };
 
@@ -251,7 +251,7 @@ mod tests {
         let mut forces = vec![0.0; 3 * count];
         stiffness.times(&wanted, 1, &mut forces);
         let mut solved = field(&forces, 1, 0);
-        stiffness.solve(&free, &mut solved, 1e-10);
+        stiffness.solve(&free, &mut solved, 1e-10, MAX_ITERATIONS);
         let mut got = vec![0.0; 3 * count];
         write(&solved, 1, 0, &mut got);
         for (got, want) in got.iter().zip(&wanted) {

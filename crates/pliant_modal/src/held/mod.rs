@@ -4,9 +4,10 @@
 //! way that the hand forces on it: the three static shapes of a force on the patch, and the six
 //! shapes of second order of their pairs (modal derivatives of the static shapes, S. R. Idelsohn
 //! and A. Cardona, *A reduction method for nonlinear structural dynamic analysis*, CMAME 49, 1985).
-//! These columns are solved on the elements around the patch when a hand takes hold, and vanish
-//! beyond them, where the coordinates suffice. What the coordinates have of them is then taken out,
-//! so that coordinates mean the same with and without the columns:
+//! These columns are solved on the region, which is the elements around the patches, when a hand
+//! takes hold, and vanish beyond it. The static shapes of two hands reach over the whole body. What
+//! the coordinates have of the columns is then taken out, so that coordinates mean the same with
+//! and without them:
 //!
 //! ```text
 //! u = Phi q + (X - Phi P) s,   P = Lambda^-1 Phi^T K X
@@ -41,11 +42,11 @@ use serde::{Deserialize, Serialize};
 pub use mesh::{SimulationMesh, VertexPlace};
 
 use self::{
-    columns::Columns,
+    columns::{Columns, Effort},
     region::{NodeLoad, Region, WeightedPoint},
 };
 use crate::{
-    HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, StepError,
+    Hand, HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, StepError,
     cubature::{self, Fit, GuidedShape, Point},
     nonlinear::Gradients,
     step::{contact_floor, residual},
@@ -61,12 +62,6 @@ const OUTSIDE: usize = 400;
 /// Largest number of points outside of the region whose forces are the reference. A reference of
 /// one point in nine was off by two percent of the force in the hand.
 const REFERENCE: usize = 24_000;
-
-/// Number of points inside the region to choose from.
-const INSIDE: usize = 4_000;
-
-/// Largest number of points of a rule, by coordinate.
-const POINTS_PER_COORDINATE: usize = 3;
 
 /// Error of the forces over the training shapes at which no more points are added.
 const TOLERANCE: f64 = 3e-3;
@@ -92,7 +87,7 @@ pub struct HeldPlace {
 
 impl HeldPlace {
     /// What identifies the patch.
-    fn key(&self) -> PatchKey {
+    pub(crate) fn key(&self) -> PatchKey {
         (self.vertex, self.radius.to_bits())
     }
 }
@@ -163,7 +158,9 @@ impl HeldShapes {
 
     /// Returns the places that a body needs shapes for, where those that it has do not suffice:
     /// they are of other patches, or hands have gone farther than a fiftieth of the size and a
-    /// tenth of their displacement since. No places: the body needs no shapes any more.
+    /// tenth of their displacement since. Those of more patches suffice: a body that one of two
+    /// hands has let go is far from where shapes of the other one alone serve. No places: the body
+    /// needs no shapes any more.
     ///
     /// At most [`HeldShapes::MAX_PATCHES`] of the places get shapes. They are in a fixed order, and
     /// their displacements are rounded, so that equal and nearby ones share their shapes.
@@ -182,14 +179,18 @@ impl HeldShapes {
         }
         let size = model.size();
         let serves = |own: &Self| {
-            let farthest =
-                own.patch_displacements.iter().map(|displacement| displacement.norm()).fold(0.0, f64::max);
-            let near = |(place, displacement): (&HeldPlace, &Vector3<f64>)| {
-                (Vector3::from(place.displacement) - displacement).norm()
-                    <= NEAR * size + NEAR_SHARE * farthest
+            let made_for = |place: &HeldPlace| {
+                let index = own.keys.iter().position(|key| *key == place.key());
+                index.and_then(|index| own.patch_displacements.get(index))
             };
-            places.iter().map(HeldPlace::key).eq(own.keys.iter().copied())
-                && places.iter().zip(&own.patch_displacements).all(near)
+            let farthest = places.iter().filter_map(made_for).map(|u| u.norm()).fold(0.0, f64::max);
+            let near = |place: &HeldPlace| {
+                made_for(place).is_some_and(|displacement| {
+                    (Vector3::from(place.displacement) - displacement).norm()
+                        <= NEAR * size + NEAR_SHARE * farthest
+                })
+            };
+            !places.is_empty() && places.iter().all(near)
         };
         if own.map_or(places.is_empty(), serves) {
             return None;
@@ -241,7 +242,8 @@ impl HeldShapes {
         let left =
             |(patch, rows): (&Patch, &cubature::Rows)| left_out(model, patch, rows, patches.len() == 1);
         let residuals = patches.iter().zip(&rows).map(left).collect::<Result<_, _>>()?;
-        let Some(rule) = rule(model, &region, law, &columns, &shapes) else { return Ok(None) };
+        let effort = Effort::of(patch_displacements);
+        let Some(rule) = rule(model, &region, law, (&columns, &shapes), effort) else { return Ok(None) };
         let omega = columns.omega(model);
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
         let mut at = vec![0.0; 3 * width];
@@ -301,6 +303,16 @@ impl HeldShapes {
         let index = self.keys.iter().position(|key| *key == (vertex, radius.to_bits()))?;
         let dot = |row: &Vec<f64>| row.iter().zip(s).map(|(u, s)| u * s).sum();
         (s.len() == self.columns).then(|| self.rows[index].each_ref().map(dot))
+    }
+
+    /// Whether others are of the same patches, in any order.
+    pub(crate) fn are_of_patches_of(&self, other: &Self) -> bool {
+        self.keys.len() == other.keys.len() && self.keys.iter().all(|key| other.keys.contains(key))
+    }
+
+    /// Whether hands hold all of the patches.
+    pub(crate) fn are_all_held(&self, hands: &[Hand]) -> bool {
+        self.keys.iter().all(|key| hands.iter().any(|hand| hand.patch.key() == *key))
     }
 
     fn find(&self, patch: &HeldPatch) -> Option<usize> {
@@ -411,8 +423,8 @@ fn rule(
     model: &ModalModel,
     region: &Region<'_>,
     law: Hyperelastic,
-    columns: &Columns,
-    shapes: &[GuidedShape],
+    (columns, shapes): (&Columns, &[GuidedShape]),
+    effort: &Effort,
 ) -> Option<Vec<Point>> {
     let omega = columns.omega(model);
     let m = omega.len();
@@ -429,9 +441,9 @@ fn rule(
         forces: &forces,
         stiffness: &stiffness,
         tolerance: TOLERANCE,
-        most: POINTS_PER_COORDINATE * m,
+        most: effort.points * m,
     };
-    let places = [thinned(&outside, OUTSIDE), thinned(&region.inside(), INSIDE)].concat();
+    let places = [thinned(&outside, OUTSIDE), thinned(&region.inside(), effort.candidates)].concat();
     let candidates = region.points(&places, columns, &region.node_rows(columns));
     let chosen = cubature::choose(&candidates, &fit);
     let point = |(index, factor): (usize, f64)| {

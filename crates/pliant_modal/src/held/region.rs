@@ -6,7 +6,7 @@ use super::{
     columns::Columns,
     elastic::{AddGradients, Amplitudes, Elastic, Generalized, Sample},
     mesh::SimulationMesh,
-    stiffness::{Stiffness, field, write, zeros},
+    stiffness::{MAX_ITERATIONS, Stiffness, field, write, zeros},
 };
 use crate::{
     Element, Hyperelastic, Patch,
@@ -16,8 +16,7 @@ use crate::{
     tetrahedron::{self, Affine, MAX_NODES},
 };
 
-/// Radius of the region around a patch, as a multiple of the patch's radius. Larger regions give no
-/// better forces (docs/decisions.md).
+/// Radius of the region around a patch, as a multiple of the patch's radius.
 const REACH: f64 = 2.0;
 
 /// Least radius of a region, as a share of the body's size.
@@ -25,6 +24,17 @@ const LEAST: f64 = 0.3;
 
 /// Maximum number of elements around one patch.
 const MAX_ELEMENTS: usize = 2_000;
+
+/// Maximum number of elements around one of two patches on which its static shapes are solved. What
+/// a body gives farther from a hand is smooth, but the coordinates do not have all of it: two hands
+/// that sheared a bunny were off by 21 % with static shapes that ended at the region. A single hand
+/// feels it as a compliance ([`super::left_out`]). Four hands that twist the end of a bar move
+/// little beyond the region, and were off by 6 % with static shapes of the whole body.
+const FAR_ELEMENTS: usize = 12_000;
+
+/// Maximum number of iterations that solve a static shape beyond the region. With 100, those of a
+/// whole bunny left the ears off by half as much again.
+const FAR_ITERATIONS: usize = 300;
 
 /// Residual of the static shapes, in the norm of the energy, at which the iteration ends. The
 /// shapes are a basis, so that they need not be exact.
@@ -41,24 +51,33 @@ pub(super) struct WeightedPoint {
     pub(super) weight: f64,
 }
 
-/// Elements of the simulation mesh around some patches.
+/// Elements of the simulation mesh around some patches: the region, and more beyond it on which the
+/// static shapes are solved.
 pub(super) struct Region<'a> {
     mesh: &'a SimulationMesh,
     kind: Element,
-    /// Numbers of the elements in the mesh, ascending.
+    /// Numbers of the region's elements in the mesh, ascending.
     elements: Vec<u32>,
-    /// Region's nodes of each of these elements.
+    /// Own nodes of each of these elements.
     nodes: Vec<[u32; MAX_NODES]>,
     affine: Vec<Affine>,
-    /// Numbers of the region's nodes in the mesh.
+    /// Numbers of the nodes in the mesh: those of the region, ascending, then those beyond it,
+    /// ascending.
     numbers: Vec<u32>,
+    /// Number of nodes of the region.
+    near: usize,
     /// Node numbers of all elements of the mesh.
     connectivity: Vec<u32>,
-    /// For each patch: whether the patch's shapes may move a node of the region.
+    /// For each patch: whether its static shapes may move a node.
     free: Vec<Vec<bool>>,
+    /// For each patch: whether its shapes of second order may move a node of the region.
+    free_near: Vec<Vec<bool>>,
     /// Whether the corrections of shapes may move a node of the region.
     free_for_any: Vec<bool>,
+    /// Stiffness of the region's elements.
     stiffness: Stiffness,
+    /// Stiffness of all elements, where there are some beyond the region.
+    far_stiffness: Option<Stiffness>,
 }
 
 /// Node numbers with shares of a load.
@@ -75,10 +94,9 @@ impl<'a> Region<'a> {
         let per = kind.node_count();
         let (connectivity, _) = tetrahedron::connectivity(mesh.corners.len(), &mesh.tets, kind);
         let corner = |i: u32| mesh.corners[i as usize].map(f64::from);
-        let around: Vec<Vec<u32>> = patches
-            .iter()
-            .map(|&(center, radius)| {
-                let reach = (REACH * radius).max(LEAST * size);
+        let around = |least: f64, most: usize| -> Vec<Vec<u32>> {
+            let around = |&(center, radius): &(Vector3<f64>, f64)| {
+                let reach = (REACH * radius).max(least * size);
                 let away = |e: u32| {
                     let middle = mesh.tets[e as usize].map(|c| Vector3::from(corner(c)));
                     (0.25 * middle.iter().sum::<Vector3<f64>>() - center).norm()
@@ -88,70 +106,115 @@ impl<'a> Region<'a> {
                     .filter(|(away, _)| *away <= reach)
                     .collect();
                 near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-                near.truncate(MAX_ELEMENTS);
+                near.truncate(most);
                 let mut near: Vec<u32> = near.into_iter().map(|(_, e)| e).collect();
                 near.sort_unstable();
                 near
-            })
-            .collect();
-        let mut elements: Vec<u32> = around.iter().flatten().copied().collect();
-        elements.sort_unstable();
-        elements.dedup();
-        let of = |e: u32| &connectivity[e as usize * per..][..per];
-        let mut numbers: Vec<u32> = elements.iter().flat_map(|&e| of(e)).copied().collect();
-        numbers.sort_unstable();
-        numbers.dedup();
-        let local = |node: u32| numbers.partition_point(|&n| n < node) as u32;
-        let nodes: Vec<[u32; MAX_NODES]> = elements
-            .iter()
-            .map(|&e| {
-                let mut out = [0; MAX_NODES];
-                out.iter_mut().zip(of(e)).for_each(|(out, &node)| *out = local(node));
-                out
-            })
-            .collect();
+            };
+            patches.iter().map(around).collect()
+        };
+        let sorted = |mut numbers: Vec<u32>| {
+            numbers.sort_unstable();
+            numbers.dedup();
+            numbers
+        };
+        let near = around(LEAST, MAX_ELEMENTS);
+        let far = if patches.len() == 2 { around(f64::INFINITY, FAR_ELEMENTS) } else { near.clone() };
+        let elements = sorted(near.iter().flatten().copied().collect());
+        let beyond: Vec<u32> = sorted(far.iter().flatten().copied().collect());
+        let beyond: Vec<u32> = beyond.into_iter().filter(|e| elements.binary_search(e).is_err()).collect();
+        let of = |e: &u32| &connectivity[*e as usize * per..][..per];
+        let mut numbers = sorted(elements.iter().flat_map(of).copied().collect());
+        let near_count = numbers.len();
+        let farther = sorted(beyond.iter().flat_map(of).copied().collect());
+        let is_farther = |node: &u32| numbers.binary_search(node).is_err();
+        let farther: Vec<u32> = farther.into_iter().filter(is_farther).collect();
+        numbers.extend(farther);
+        let own_nodes = |e: &u32| {
+            let mut out = [0; MAX_NODES];
+            let local = |node| local(&numbers, near_count, node).unwrap_or_default();
+            out.iter_mut().zip(of(e)).for_each(|(out, &node)| *out = local(node));
+            out
+        };
         // All energies are linear in the moduli, so their factor goes into the volume.
-        let affine: Vec<Affine> = elements
-            .iter()
-            .map(|&e| {
-                let affine = Affine::new(mesh.tets[e as usize].map(corner));
-                Affine { volume: affine.volume * mesh.stiffness(e), ..affine }
-            })
-            .collect();
+        let weighed = |e: &u32| {
+            let affine = Affine::new(mesh.tets[*e as usize].map(corner));
+            Affine { volume: affine.volume * mesh.stiffness(*e), ..affine }
+        };
+        let nodes: Vec<[u32; MAX_NODES]> = elements.iter().map(own_nodes).collect();
+        let affine: Vec<Affine> = elements.iter().map(weighed).collect();
         // A shape ends where an element outside begins, so that it is continuous.
         let mut uses = vec![0u32; numbers.len()];
         for &node in &connectivity {
-            if let Ok(at) = numbers.binary_search(&node) {
-                uses[at] += 1;
+            if let Some(at) = local(&numbers, near_count, node) {
+                uses[at as usize] += 1;
             }
         }
         let anchored: Vec<bool> = numbers.iter().map(|&n| mesh.is_anchored(n)).collect();
-        let inner = |elements: &[u32]| -> Vec<bool> {
+        let inner = |elements: &[u32], count: usize| -> Vec<bool> {
             let mut own = vec![0u32; numbers.len()];
-            for &e in elements {
-                of(e).iter().for_each(|&node| own[local(node) as usize] += 1);
+            for node in elements.iter().flat_map(of) {
+                if let Some(at) = local(&numbers, near_count, *node) {
+                    own[at as usize] += 1;
+                }
             }
-            let nodes = own.iter().zip(&uses).zip(&anchored);
+            let nodes = own.iter().zip(&uses).zip(&anchored).take(count);
             nodes.map(|((own, all), anchored)| own == all && !anchored).collect()
         };
-        let free: Vec<Vec<bool>> = around.iter().map(|around| inner(around)).collect();
+        let free_near: Vec<Vec<bool>> = near.iter().map(|around| inner(around, near_count)).collect();
         // Something must hold the shapes of a free body.
-        let mut free_for_any = inner(&elements);
-        if let (true, Some(first)) = (free_for_any.iter().all(|free| *free), free.first()) {
+        let held = |free: Vec<bool>, near: &[bool]| {
+            if free.iter().all(|free| *free) {
+                let beyond = std::iter::repeat_n(false, numbers.len() - near.len());
+                return near.iter().copied().chain(beyond).collect();
+            }
+            free
+        };
+        let free = far
+            .iter()
+            .zip(&free_near)
+            .map(|(around, near)| held(inner(around, numbers.len()), near))
+            .collect();
+        let mut free_for_any = inner(&elements, near_count);
+        if let (true, Some(first)) = (free_for_any.iter().all(|free| *free), free_near.first()) {
             free_for_any.clone_from(first);
         }
-        let stiffness = Stiffness::new(kind, law, numbers.len(), &nodes, &affine);
-        Self { mesh, kind, elements, nodes, affine, numbers, connectivity, free, free_for_any, stiffness }
+        let stiffness = Stiffness::new(kind, law, near_count, &nodes, &affine);
+        let far_stiffness = (!beyond.is_empty()).then(|| {
+            let nodes = [nodes.clone(), beyond.iter().map(own_nodes).collect()].concat();
+            let affine = [affine.clone(), beyond.iter().map(weighed).collect()].concat();
+            Stiffness::new(kind, law, numbers.len(), &nodes, &affine)
+        });
+        Self {
+            mesh,
+            kind,
+            elements,
+            nodes,
+            affine,
+            numbers,
+            near: near_count,
+            connectivity,
+            free,
+            free_near,
+            free_for_any,
+            stiffness,
+            far_stiffness,
+        }
     }
 
     /// Whether every patch's shapes are held somewhere: at an anchor or where the region ends.
     pub(super) fn is_held(&self) -> bool {
-        self.free.iter().all(|free| free.iter().any(|free| !free))
+        self.free_near.iter().all(|free| free.iter().any(|free| !free))
     }
 
-    /// Number of nodes.
+    /// Number of nodes of the region and beyond it.
     pub(super) fn node_count(&self) -> usize {
         self.numbers.len()
+    }
+
+    /// Own number of a node of the mesh.
+    fn local(&self, node: u32) -> Option<usize> {
+        local(&self.numbers, self.near, node).map(|own| own as usize)
     }
 
     /// Octave of the moduli of an element of the mesh. Only elements of one octave may stand for
@@ -195,7 +258,7 @@ impl<'a> Region<'a> {
             for (modal, phi) in modal.iter_mut().zip(phi.chunks_exact(modes)) {
                 modal.iter_mut().zip(phi).for_each(|(out, x)| *out += share * x);
             }
-            let Ok(at) = self.numbers.binary_search(&node) else { continue };
+            let Some(at) = self.local(node) else { continue };
             let column = columns[3 * at * width..][..3 * width].chunks_exact(width);
             for (own, x) in own.iter_mut().zip(column) {
                 own.iter_mut().zip(x).for_each(|(out, x)| *out += share * x);
@@ -228,8 +291,9 @@ impl<'a> Region<'a> {
     pub(super) fn columns_at(&self, vertex: u32, columns: &[f64], width: usize, out: &mut [f64]) -> bool {
         let mut moved = false;
         self.vertex(vertex, &mut |node, share| {
-            let Ok(at) = self.numbers.binary_search(&node) else { return };
-            if !self.free_for_any[at] && !self.free.iter().any(|free| free[at]) {
+            let Some(at) = self.local(node) else { return };
+            if !self.free_for_any.get(at).is_some_and(|free| *free) && !self.free.iter().any(|free| free[at])
+            {
                 return;
             }
             if !moved {
@@ -243,24 +307,28 @@ impl<'a> Region<'a> {
     }
 
     /// The static shape of each axis of a load on the patch with this index, and the shapes of
-    /// second order of all six pairs of them: nine columns, `[node][axis][column]`.
+    /// second order of all six pairs of them: nine columns, `[node][axis][column]`. Those of second
+    /// order move the region alone.
     pub(super) fn static_shapes(&self, index: usize, load: &NodeLoad, law: Hyperelastic) -> Vec<f64> {
         let nodes = self.node_count();
         let mut first = vec![0.0; 9 * nodes];
         for &(node, share) in load {
-            if let Ok(at) = self.numbers.binary_search(&node) {
+            if let Some(at) = self.local(node) {
                 (0..3).for_each(|axis| first[(3 * at + axis) * 3 + axis] += share);
             }
         }
-        let free = &self.free[index];
-        let solve = |values: &mut [f64], width: usize| {
-            let mut forces = field(values, width, 0);
-            self.stiffness.solve(free, &mut forces, STATIC);
-            write(&forces, width, 0, values);
+        let mut forces = field(&first, 3, 0);
+        let (stiffness, iterations) = match &self.far_stiffness {
+            Some(far) => (far, FAR_ITERATIONS),
+            None => (&self.stiffness, MAX_ITERATIONS),
         };
-        solve(&mut first, 3);
+        stiffness.solve(&self.free[index], &mut forces, STATIC, iterations);
+        write(&forces, 3, 0, &mut first);
         let mut second = self.second_order_forces(&first, law);
-        solve(&mut second, 6);
+        let mut forces = field(&second, 6, 0);
+        self.stiffness.solve(&self.free_near[index], &mut forces, STATIC, MAX_ITERATIONS);
+        write(&forces, 6, 0, &mut second);
+        second.resize(18 * nodes, 0.0);
         let mut out = Vec::with_capacity(27 * nodes);
         for (a, b) in first.chunks_exact(3).zip(second.chunks_exact(6)) {
             out.extend(a);
@@ -298,7 +366,7 @@ impl<'a> Region<'a> {
     ) -> Vec<f64> {
         let tangent = at.map(|q| self.stiffness_in(q, columns, law));
         let stiffness = tangent.as_ref().unwrap_or(&self.stiffness);
-        let nodes = self.node_count();
+        let nodes = self.near;
         let mut out = vec![0.0; 3 * nodes * shapes.len()];
         let elements: Vec<Sample> = self
             .nodes
@@ -307,7 +375,7 @@ impl<'a> Region<'a> {
             .map(|(nodes, affine)| Sample { nodes: *nodes, affine: *affine, share: 1.0 })
             .collect();
         let numbers: Vec<(u32, Option<u32>)> =
-            self.numbers.iter().zip(0..).map(|(&node, own)| (node, Some(own))).collect();
+            self.numbers[..nodes].iter().zip(0..).map(|(&node, own)| (node, Some(own))).collect();
         for (group, shapes_of) in shapes.chunks(LANES).enumerate() {
             let at = Amplitudes::new(shapes_of.iter().map(|shape| &shape.q[..]), columns);
             let mut forces = zeros(nodes);
@@ -325,14 +393,16 @@ impl<'a> Region<'a> {
             for (lane, shape) in shapes_of.iter().enumerate() {
                 for (load, force) in loads.iter().zip(&shape.forces) {
                     for &(node, share) in load {
-                        let Ok(at) = self.numbers.binary_search(&node) else { continue };
-                        for (axis, out) in forces[at].iter_mut().enumerate() {
+                        let Some(force_at) = self.local(node).and_then(|at| forces.get_mut(at)) else {
+                            continue;
+                        };
+                        for (axis, out) in force_at.iter_mut().enumerate() {
                             out.0[lane] += share * force[axis];
                         }
                     }
                 }
             }
-            stiffness.solve(&self.free_for_any, &mut forces, CORRECTED);
+            stiffness.solve(&self.free_for_any, &mut forces, CORRECTED, MAX_ITERATIONS);
             write(&forces, shapes.len(), group * LANES, &mut out);
         }
         out
@@ -360,8 +430,7 @@ impl<'a> Region<'a> {
         let mut nodes: Vec<(u32, Option<u32>)> = Vec::new();
         for (node, local) in local.iter_mut().enumerate().filter(|(_, local)| **local == 0) {
             *local = nodes.len() as u32;
-            let own = self.numbers.binary_search(&(node as u32)).ok();
-            nodes.push((node as u32, own.map(|own| own as u32)));
+            nodes.push((node as u32, self.local(node as u32).map(|own| own as u32)));
         }
         let elements: Vec<Sample> = sampled
             .iter()
@@ -404,7 +473,7 @@ impl<'a> Region<'a> {
     /// The nodal forces of second order of the pairs of three shapes.
     fn second_order_forces(&self, shapes: &[f64], law: Hyperelastic) -> Vec<f64> {
         const PAIRS: [(usize, usize); 6] = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)];
-        let mut out = vec![0.0; 2 * shapes.len()];
+        let mut out = vec![0.0; 18 * self.near];
         let mut h = [Matrix3::zeros(); 3];
         for element in 0..self.elements.len() {
             self.at_points(element, shapes, &mut h, |weight, nodes, g, h| {
@@ -449,10 +518,16 @@ impl<'a> Region<'a> {
         }
     }
 
-    /// `A^T K B` of columns `a` and `b` on the region, row by row.
+    /// The stiffness of the elements around the nodes that columns are given for.
+    fn stiffness_of(&self, nodes: usize) -> &Stiffness {
+        self.far_stiffness.as_ref().filter(|_| nodes > self.near).unwrap_or(&self.stiffness)
+    }
+
+    /// `A^T K B` of columns `a` and `b`, row by row. Columns that move the region alone may be
+    /// given for its nodes alone.
     pub(super) fn energies(&self, [a, b]: [&[f64]; 2], [rows, width]: [usize; 2]) -> Vec<f64> {
         let mut forces = vec![0.0; b.len()];
-        self.stiffness.times(b, width, &mut forces);
+        self.stiffness_of(b.len() / (3 * width)).times(b, width, &mut forces);
         let mut out = vec![0.0; rows * width];
         for (x, f) in a.chunks_exact(rows).zip(forces.chunks_exact(width)) {
             for (out, x) in out.chunks_exact_mut(width).zip(x) {
@@ -462,11 +537,12 @@ impl<'a> Region<'a> {
         out
     }
 
-    /// `Phi^T K Y` of the coordinates and columns on the region, `[coordinate][column]`.
+    /// `Phi^T K Y` of the coordinates and columns, `[coordinate][column]`. Columns that move the
+    /// region alone may be given for its nodes alone.
     pub(super) fn coupling(&self, columns: &[f64], width: usize) -> Vec<f64> {
         let modes = self.mesh.scales.len();
         let mut forces = vec![0.0; columns.len()];
-        self.stiffness.times(columns, width, &mut forces);
+        self.stiffness_of(columns.len() / (3 * width)).times(columns, width, &mut forces);
         let (mut out, mut phi) = (vec![0.0; modes * width], vec![0.0; 3 * modes]);
         for (node, forces) in self.numbers.iter().zip(forces.chunks_exact(3 * width)) {
             self.mesh.coordinates(*node, &mut phi);
@@ -483,7 +559,7 @@ impl<'a> Region<'a> {
     /// by the coordinates after them, `[node][axis][..]`.
     pub(super) fn node_rows(&self, columns: &Columns) -> Vec<f64> {
         let all = columns.width + self.mesh.scales.len();
-        let mut out = vec![0.0; 3 * self.node_count() * all];
+        let mut out = vec![0.0; 3 * self.near * all];
         for ((own, &node), out) in (0..).zip(&self.numbers).zip(out.chunks_exact_mut(3 * all)) {
             self.node_row(node, Some(own), columns, out);
         }
@@ -519,13 +595,12 @@ impl<'a> Region<'a> {
             let g = affine.shape_gradients(self.kind, points[place.point % points.len()]);
             let nodes = &self.connectivity[place.element as usize * per..][..per];
             let mut gradients = vec![0.0; 9 * all];
-            let inside = self.elements.binary_search(&place.element).is_ok();
             for (&node, g) in nodes.iter().zip(&g) {
-                let own = if inside { self.numbers.binary_search(&node).ok() } else { None };
+                let own = self.local(node);
                 let rows = match own {
-                    Some(own) => &rows[3 * own * all..][..3 * all],
-                    None => {
-                        self.node_row(node, None, columns, &mut outer);
+                    Some(own) if own < self.near => &rows[3 * own * all..][..3 * all],
+                    _ => {
+                        self.node_row(node, own, columns, &mut outer);
                         &outer
                     }
                 };
@@ -571,4 +646,11 @@ impl<'a> Region<'a> {
             })
             .collect()
     }
+}
+
+/// Own number of a node of the mesh, given the numbers of the own nodes, those of the region first.
+fn local(numbers: &[u32], near: usize, node: u32) -> Option<u32> {
+    let (near, far) = numbers.split_at(near);
+    let found = near.binary_search(&node).or_else(|_| far.binary_search(&node).map(|at| near.len() + at));
+    found.ok().map(|at| at as u32)
 }

@@ -11,8 +11,8 @@ use crate::{
     tetrahedron::{self, Affine, MAX_NODES},
 };
 
-/// Maximum number of iterations of a static solution.
-const MAX_ITERATIONS: usize = 100;
+/// Maximum number of iterations of a solution on a region.
+pub(super) const MAX_ITERATIONS: usize = 100;
 
 /// A vector at each node of a region, of eight columns.
 pub(super) type Field = Vec<[Lane; 3]>;
@@ -175,8 +175,9 @@ impl Stiffness {
     }
 
     /// Replaces forces by displacements of the free nodes, for eight columns, until the residual in
-    /// the norm of the energy falls below a share `enough` of what it was.
-    pub(super) fn solve(&self, free: &[bool], f: &mut [[Lane; 3]], enough: f64) {
+    /// the norm of the energy falls below a share `enough` of what it was, in at most `most`
+    /// iterations.
+    pub(super) fn solve(&self, free: &[bool], f: &mut [[Lane; 3]], enough: f64, most: usize) {
         let inverses: Vec<Matrix3<f64>> = (0..free.len())
             .map(|row| {
                 let range = self.offsets[row]..self.offsets[row + 1];
@@ -185,7 +186,7 @@ impl Stiffness {
                 diagonal.filter(|_| free[row]).unwrap_or_default()
             })
             .collect();
-        widest(Solve { stiffness: self, inverses: &inverses, f, enough });
+        widest(Solve { stiffness: self, inverses: &inverses, f, enough, most });
     }
 
     #[inline(always)]
@@ -252,13 +253,14 @@ struct Solve<'a> {
     inverses: &'a [Matrix3<f64>],
     f: &'a mut [[Lane; 3]],
     enough: f64,
+    most: usize,
 }
 
 impl Work for Solve<'_> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
-        let Self { stiffness, inverses, f, enough } = self;
+        let Self { stiffness, inverses, f, enough, most } = self;
         let zero = Lane::splat(0.0);
         let ratio = |a: Lane, b: Lane| zero.if_less(b, a / b.max(f64::MIN_POSITIVE), zero);
         let mut residual = f.to_vec();
@@ -268,7 +270,7 @@ impl Work for Solve<'_> {
         let mut left = dots(&residual, &z);
         let goal = Lane::splat(enough * enough) * left;
         f.fill([zero; 3]);
-        for _ in 0..MAX_ITERATIONS {
+        for _ in 0..most {
             stiffness.multiply(&direction, &mut forces);
             // Nodes that are not free have no direction, and their forces count for nothing.
             let step = ratio(left, dots(&direction, &forces));

@@ -212,9 +212,9 @@ impl Kernel {
     ///
     /// Hands on other patches feel what the modes leave out as a compliance, as all hands do
     /// without shapes. The shapes of `state` come to rest under the forces of `hands`, so that
-    /// these go on as they were. A body that nobody holds any more gains no energy when its shapes
-    /// go: what it would gain is taken from its velocities, and where these do not suffice the
-    /// coordinates yield.
+    /// these go on as they were, and so do stiff coordinates where the patches are others. Where
+    /// nobody holds a patch of the old shapes any more, the body gains no energy: what it would gain
+    /// is taken from its velocities, and where these do not suffice the coordinates yield.
     ///
     /// # Errors
     /// Returns [`StepError::OtherModel`] for shapes of another model, and [`StepError::Length`] for
@@ -233,6 +233,13 @@ impl Kernel {
         let before = self.elastic.as_ref().filter(|elastic| elastic.shapes().is_some());
         let before = before.filter(|elastic| state.s.len() == elastic.columns());
         let before = before.map(|elastic| elastic.energy(state));
+        let is_let_go = self.held_shapes().is_some_and(|shapes| !shapes.are_all_held(hands));
+        let have_changed = match (self.held_shapes(), &shapes) {
+            (Some(old), Some(new)) => !old.are_of_patches_of(new),
+            (old, new) => old.is_some() != new.is_some(),
+        };
+        let mut force = vec![0.0; state.q.len()];
+        self.elastic_force(state, &mut force);
         state.s.clear();
         if self.elastic.is_none() {
             return Ok(());
@@ -240,7 +247,10 @@ impl Kernel {
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
         self.equilibrate_columns(state, hands);
-        if let (Some(most), Some(elastic), true) = (before, &mut self.elastic, hands.is_empty()) {
+        if let (Some(elastic), true) = (&mut self.elastic, have_changed && !hands.is_empty()) {
+            elastic.settle(state, &force);
+        }
+        if let (Some(most), Some(elastic), true) = (before, &mut self.elastic, is_let_go) {
             elastic.lower(most, state);
         }
         Ok(())

@@ -8,6 +8,9 @@ use crate::{
     step::{HeldPatch, State},
 };
 
+/// How long a body yields at once when its shapes change, s.
+const SETTLING: f64 = 0.05;
+
 impl ElasticStep {
     /// Brings the columns to rest under the hands' forces (N, body axes), while the coordinates
     /// stay where they are.
@@ -16,14 +19,11 @@ impl ElasticStep {
         state: &mut State,
         pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>,
     ) {
-        /// Number of Newton rounds.
-        const ROUNDS: usize = 8;
         let columns = self.columns;
         let Some(shapes) = self.shapes.clone() else {
             state.s.clear();
             return;
         };
-        join(columns, state, &mut self.q);
         let mut load = vec![0.0; columns];
         for (patch, pull) in pulls {
             let Some(rows) = shapes.rows(patch) else { continue };
@@ -31,23 +31,65 @@ impl ElasticStep {
                 load.iter_mut().zip(row).for_each(|(load, u)| *load += pull * u);
             }
         }
+        join(columns, state, &mut self.q);
+        self.come_to_rest(&load, &vec![0.0; columns]);
+        state.s.clear();
+        state.s.extend(self.q[..columns].iter().map(|s| if s.is_finite() { *s } else { 0.0 }));
+    }
+
+    /// Brings a body on to where it would go in a while under the elastic force on its coordinates
+    /// (kg^1/2 m/s^2) that it had before its energy changed, so that what is stiff is at rest.
+    pub(crate) fn settle(&mut self, state: &mut State, force: &[f64]) {
+        if state.s.len() != self.columns {
+            return;
+        }
+        join(self.columns, state, &mut self.q);
+        let mut load = vec![0.0; self.q.len()];
+        self.energy.force_at(&self.q, &mut load);
+        load[self.columns..].iter_mut().zip(force).for_each(|(load, force)| *load = *force);
+        let mut inertia = vec![0.0; self.q.len()];
+        for (inertia, damping) in inertia[self.columns..].iter_mut().zip(&self.damping) {
+            *inertia = (1.0 / SETTLING + damping) / SETTLING;
+        }
+        self.come_to_rest(&load, &inertia);
+        if self.q.iter().all(|q| q.is_finite()) {
+            let (columns, modal) = self.q.split_at(self.columns);
+            state.s.clear();
+            state.s.extend_from_slice(columns);
+            state.q.copy_from_slice(modal);
+        }
+    }
+
+    /// Brings the first of `self.q`, as many as there are loads, to rest under these and `inertia`
+    /// (1/s^2), which holds each of them where it is.
+    fn come_to_rest(&mut self, load: &[f64], inertia: &[f64]) {
+        /// Number of Newton rounds.
+        const ROUNDS: usize = 8;
+        let count = load.len();
+        let start = self.q[..count].to_vec();
         let potential = |energy: &ElasticEnergy, q: &[f64]| {
-            energy.energy(q) - load.iter().zip(q).map(|(f, q)| f * q).sum::<f64>()
+            let load = load.iter().zip(q).map(|(f, q)| f * q).sum::<f64>();
+            let away = q.iter().zip(&start).map(|(q, start)| (q - start).powi(2));
+            energy.energy(q) - load
+                + 0.5 * away.zip(inertia).map(|(away, inertia)| away * inertia).sum::<f64>()
         };
-        let mut factor = Cholesky::new(columns);
+        let mut factor = Cholesky::new(count);
         for _ in 0..ROUNDS {
             self.energy.linearize(&self.q);
-            for (i, row) in factor.matrix().chunks_exact_mut(columns).enumerate() {
+            for (i, (row, inertia)) in factor.matrix().chunks_exact_mut(count).zip(inertia).enumerate() {
                 self.energy.tangent_row(i, &mut row[i..]);
+                row[i] += inertia;
             }
             factor.factor();
-            let missing = load.iter().zip(self.energy.force());
-            let mut increment: Vec<f64> = missing.map(|(load, force)| load - force).collect();
+            let away = self.q.iter().zip(&start).map(|(q, start)| q - start);
+            let forces = self.energy.force().iter().zip(inertia.iter().zip(away));
+            let forces = forces.map(|(force, (inertia, away))| force + inertia * away);
+            let mut increment: Vec<f64> = load.iter().zip(forces).map(|(load, force)| load - force).collect();
             factor.solve(&mut increment);
             // The columns have energy one half each at one.
-            let size: f64 =
-                increment.iter().map(|increment| 0.5 * self.omega2[0] * increment * increment).sum();
-            let (before, old) = (potential(&self.energy, &self.q), self.q[..columns].to_vec());
+            let energies = increment.iter().zip(&self.omega2);
+            let size: f64 = energies.map(|(increment, omega2)| 0.5 * omega2 * increment * increment).sum();
+            let (before, old) = (potential(&self.energy, &self.q), self.q[..count].to_vec());
             let mut share = 1.0;
             for _ in 0..HALVINGS {
                 for ((s, old), increment) in self.q.iter_mut().zip(&old).zip(&increment) {
@@ -62,8 +104,6 @@ impl ElasticStep {
                 break;
             }
         }
-        state.s.clear();
-        state.s.extend(self.q[..columns].iter().map(|s| if s.is_finite() { *s } else { 0.0 }));
     }
 
     /// Takes the elastic energy beyond `most` (J) from a state: from its velocities, and where
@@ -150,6 +190,25 @@ impl ElasticStep {
             if best.1 == 0.0 {
                 break;
             }
+        }
+        // The rounds slow down where the energy is not convex. The shape then shrinks as a whole,
+        // down to rest, where there is no energy.
+        if now.is_nan() || now > most {
+            begun.copy_from_slice(&all);
+            let mut scale = |share: f64| {
+                all.iter_mut().zip(&begun).for_each(|(q, begun)| *q = share * begun);
+                self.energy.energy(&all)
+            };
+            let (mut low, mut high) = (0.0, 1.0);
+            for _ in 0..BISECTIONS {
+                let share = 0.5 * (low + high);
+                if scale(share) <= most {
+                    low = share;
+                } else {
+                    high = share;
+                }
+            }
+            scale(low);
         }
         let (columns, modal) = all.split_at(self.columns);
         state.s.clear();

@@ -113,10 +113,21 @@ impl Kernel {
         for (hand, forces) in hands.iter().zip(&self.forces) {
             hand.patch.rows().spread(forces, warp, &mut self.pulls);
         }
+        let [force, torque] = self.total(&place);
+        // What the hands give to the motion of the frame, J.
+        let mut carried = 0.0;
+        if let Some(rigid) = &rigid {
+            let unheld = state.frame.kinetic_energy(&self.model);
+            rigid.apply(&mut state.frame, &self.model, force, torque + place.slack(rigid));
+            carried = state.frame.kinetic_energy(&self.model) - unheld;
+        }
         if let Some(elastic) = &mut self.elastic {
             let ends = [&self.before.q[..], elastic.coordinates()];
             let shapes = elastic.shapes();
-            let supplied = hands
+            let is_led =
+                |hand: &Hand| matches!(hand.hold, Hold::Target { .. }) && hand.mean != Vector3::zeros();
+            let are_led = hands.iter().all(is_led);
+            let supplied: f64 = hands
                 .iter()
                 .zip(&self.solving)
                 .map(|(hand, solving)| {
@@ -124,28 +135,24 @@ impl Kernel {
                         0.5 * force.dot(&(turned(&self.creep, shapes, hand, q) * force))
                     };
                     let force = &solving.pull;
-                    let on_body = force.dot(&elastic.patch_displacement(&hand.patch));
                     match hand.hold {
                         // The hand supplies the residual flexibility of its patch first. That turns
                         // with the patch, and must not give back more than it got.
-                        Hold::Target { velocity, .. } if rigid.is_none() && hand.mean != Vector3::zeros() => {
+                        Hold::Target { velocity, .. } if is_led(hand) && (are_led || rigid.is_none()) => {
                             let before = stored(ends[0], &(place.back * hand.mean));
                             self.h * force.dot(&(place.back * velocity)) + before - stored(ends[1], force)
                         }
-                        _ => on_body,
+                        _ => force.dot(&elastic.patch_displacement(&hand.patch)),
                     }
                 })
                 .sum();
+            let supplied = if are_led { supplied - carried } else { supplied };
             elastic.finish(&self.before, supplied, &mut self.force, state);
         } else {
             self.modes.respond(&self.pulls, state);
             for (f, pull) in self.force.iter_mut().zip(&self.pulls) {
                 *f += pull;
             }
-        }
-        let [force, torque] = self.total(&place);
-        if let Some(rigid) = &rigid {
-            rigid.apply(&mut state.frame, &self.model, force, torque + place.slack(rigid));
         }
         for (hand, solving) in hands.iter_mut().zip(&self.solving) {
             hand.viscoelastic = self.creep.step(hand, &solving.pull);
