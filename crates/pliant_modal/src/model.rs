@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::contact::ContactSites;
 use crate::moments::Moments;
-use crate::step::MassSites;
+use crate::step::{MassSites, SharedModes};
 use crate::{
     Basis, Hyperelastic, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh,
     check::check_parts, nonlinear::Gradients,
@@ -175,6 +175,8 @@ pub struct ModalModel {
     half: OnceLock<Basis>,
     /// The mass sites for gravity on a bent body, made at the first request.
     mass_sites: OnceLock<Arc<MassSites>>,
+    /// The coefficients of the steps of its bodies.
+    shared_modes: SharedModes,
     /// The first moments of the modes, made at the first request.
     moments: OnceLock<Arc<Moments>>,
     /// The contact sites for all modes, made at the first request.
@@ -234,6 +236,7 @@ impl ModalModel {
             basis,
             half: OnceLock::new(),
             mass_sites: OnceLock::new(),
+            shared_modes: SharedModes::default(),
             moments: OnceLock::new(),
             contact_sites: OnceLock::new(),
             gradients: OnceLock::new(),
@@ -246,6 +249,10 @@ impl ModalModel {
 
     pub(crate) fn mass_sites(&self) -> &MassSites {
         self.mass_sites.get_or_init(|| Arc::new(MassSites::new(self)))
+    }
+
+    pub(crate) fn shared_modes(&self) -> &SharedModes {
+        &self.shared_modes
     }
 
     pub(crate) fn contact_sites(&self) -> Result<Arc<ContactSites>, StepError> {

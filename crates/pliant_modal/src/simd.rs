@@ -124,6 +124,8 @@ pub(crate) trait Doubles: Copy {
     unsafe fn load(from: &[f64; 8]) -> Self;
     unsafe fn load_single(from: &[f32; 8]) -> Self;
     unsafe fn store(self, to: &mut [f64; 8]);
+    unsafe fn add(self, other: Self) -> Self;
+    unsafe fn mul(self, by: Self) -> Self;
     /// Computes `self * by + plus` with one rounding.
     unsafe fn fused(self, by: Self, plus: Self) -> Self;
 }
@@ -148,6 +150,14 @@ impl Doubles for PortableDoubles {
     #[inline(always)]
     unsafe fn store(self, to: &mut [f64; 8]) {
         *to = self.0;
+    }
+    #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        Self(std::array::from_fn(|l| self.0[l] + other.0[l]))
+    }
+    #[inline(always)]
+    unsafe fn mul(self, by: Self) -> Self {
+        Self(std::array::from_fn(|l| self.0[l] * by.0[l]))
     }
     #[inline(always)]
     unsafe fn fused(self, by: Self, plus: Self) -> Self {
@@ -202,13 +212,13 @@ impl Lanes for Portable {
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86 {
     use std::arch::x86_64::{
-        __m256, __m256d, __m512, __m512d, _CMP_LE_OQ, _mm_loadu_ps, _mm_loadu_si128, _mm256_and_ps,
-        _mm256_cmp_ps, _mm256_cvtph_ps, _mm256_cvtps_pd, _mm256_fmadd_pd, _mm256_fmadd_ps, _mm256_fnmadd_ps,
-        _mm256_loadu_pd, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_movemask_ps, _mm256_mul_ps,
-        _mm256_set1_pd, _mm256_set1_ps, _mm256_storeu_pd, _mm256_storeu_ps, _mm512_cmp_ps_mask,
-        _mm512_cvtph_ps, _mm512_cvtps_pd, _mm512_fmadd_pd, _mm512_fmadd_ps, _mm512_fnmadd_ps,
-        _mm512_loadu_pd, _mm512_loadu_ps, _mm512_mul_ps, _mm512_set1_pd, _mm512_set1_ps, _mm512_storeu_pd,
-        _mm512_storeu_ps,
+        __m256, __m256d, __m512, __m512d, _CMP_LE_OQ, _mm_loadu_ps, _mm_loadu_si128, _mm256_add_pd,
+        _mm256_and_ps, _mm256_cmp_ps, _mm256_cvtph_ps, _mm256_cvtps_pd, _mm256_fmadd_pd, _mm256_fmadd_ps,
+        _mm256_fnmadd_ps, _mm256_loadu_pd, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_movemask_ps,
+        _mm256_mul_pd, _mm256_mul_ps, _mm256_set1_pd, _mm256_set1_ps, _mm256_storeu_pd, _mm256_storeu_ps,
+        _mm512_add_pd, _mm512_cmp_ps_mask, _mm512_cvtph_ps, _mm512_cvtps_pd, _mm512_fmadd_pd,
+        _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_loadu_pd, _mm512_loadu_ps, _mm512_mul_pd, _mm512_mul_ps,
+        _mm512_set1_pd, _mm512_set1_ps, _mm512_storeu_pd, _mm512_storeu_ps,
     };
 
     use half::f16;
@@ -378,6 +388,16 @@ pub(crate) mod x86 {
             unsafe { _mm512_storeu_pd(to.as_mut_ptr(), self.0) }
         }
         #[inline(always)]
+        unsafe fn add(self, other: Self) -> Self {
+            // SAFETY: The caller has checked for AVX-512F.
+            Self(unsafe { _mm512_add_pd(self.0, other.0) })
+        }
+        #[inline(always)]
+        unsafe fn mul(self, by: Self) -> Self {
+            // SAFETY: The caller has checked for AVX-512F.
+            Self(unsafe { _mm512_mul_pd(self.0, by.0) })
+        }
+        #[inline(always)]
         unsafe fn fused(self, by: Self, plus: Self) -> Self {
             // SAFETY: The caller has checked for AVX-512F. References are to 8 numbers.
             Self(unsafe { _mm512_fmadd_pd(self.0, by.0, plus.0) })
@@ -415,6 +435,16 @@ pub(crate) mod x86 {
                 _mm256_storeu_pd(p, self.0);
                 _mm256_storeu_pd(p.add(4), self.1);
             }
+        }
+        #[inline(always)]
+        unsafe fn add(self, other: Self) -> Self {
+            // SAFETY: The caller has checked for AVX2.
+            unsafe { Self(_mm256_add_pd(self.0, other.0), _mm256_add_pd(self.1, other.1)) }
+        }
+        #[inline(always)]
+        unsafe fn mul(self, by: Self) -> Self {
+            // SAFETY: The caller has checked for AVX2.
+            unsafe { Self(_mm256_mul_pd(self.0, by.0), _mm256_mul_pd(self.1, by.1)) }
         }
         #[inline(always)]
         unsafe fn fused(self, by: Self, plus: Self) -> Self {

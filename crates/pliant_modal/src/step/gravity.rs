@@ -6,7 +6,7 @@ use crate::warp::coefficients_of;
 use crate::{
     ModalModel, StepError,
     error::finite,
-    simd::{Work, widest},
+    simd::{Doubles, Kernel, Lanes, with_registers},
 };
 
 /// Motion of the anchors of a body through the world at one moment. The anchors move as one rigid
@@ -75,6 +75,17 @@ const SITES: usize = 16;
 /// One number per part.
 type Each = [f64; SITES];
 
+/// Displacement (x, y, z) and rotation (x, y, z) of each part, or the conjugate forces. The parts
+/// are stored side by side, so that one instruction handles several. No register crosses the edge
+/// of a cache line.
+#[derive(Debug, Clone, Copy)]
+#[repr(align(64))]
+struct Sixes([Each; 6]);
+
+impl Sixes {
+    const ZERO: Self = Self([[0.0; SITES]; 6]);
+}
+
 /// The mass of a body, divided into parts around sites on the surface.
 ///
 /// The participations give the modal force of gravity on the undeformed shape up to rounding. On a
@@ -87,9 +98,8 @@ pub(crate) struct MassSites {
     mass: Each,
     /// Place of each part at rest (x, y, z), m.
     places: [Each; 3],
-    /// Displacement (x, y, z) and rotation (x, y, z) of each part per mode. The parts are stored
-    /// side by side, so that one instruction handles several.
-    modes: Vec<[Each; 6]>,
+    /// Displacement and rotation of the parts per mode.
+    modes: Vec<Sixes>,
 }
 
 impl MassSites {
@@ -121,7 +131,7 @@ impl MassSites {
             if mass.is_finite() { mass } else { 0.0 }
         });
         let mut places = [[0.0; SITES]; 3];
-        let mut modes = vec![[[0.0; SITES]; 6]; model.mode_count()];
+        let mut modes = vec![Sixes::ZERO; model.mode_count()];
         for (vertex, (&(_, site), area)) in nearest.iter().zip(&areas).enumerate() {
             let weight = area / share[site];
             if mass[site] <= 0.0 {
@@ -130,7 +140,7 @@ impl MassSites {
             for (place, x) in places.iter_mut().zip(positions[vertex].iter()) {
                 place[site] += weight * x;
             }
-            for (mode, rows) in modes.iter_mut().enumerate() {
+            for (mode, Sixes(rows)) in modes.iter_mut().enumerate() {
                 for axis in 0..3 {
                     let moved = f64::from(model.displacement_row(vertex as u32, axis, mode));
                     let turned = f64::from(model.rotation_row(vertex as u32, axis, mode));
@@ -143,145 +153,311 @@ impl MassSites {
     }
 
     /// Work of a force beyond that on the undeformed shape, from rest to the shape `q`, J.
-    pub(crate) fn work(&self, force: &MassForce, q: &[f64]) -> f64 {
-        let mut six = self.reduce(q);
-        self.work_and_forces(force, &mut six)
+    pub(crate) fn work(&self, by: &MassForce, q: &[f64]) -> f64 {
+        with_registers(Gain { sites: self, by, q, force: &mut [] })
     }
 
     /// Returns the same work as [`MassSites::work`] and adds its gradient, the modal force, to
     /// `force`.
     pub(crate) fn add(&self, by: &MassForce, q: &[f64], force: &mut [f64]) -> f64 {
-        let mut six = self.reduce(q);
-        let work = self.work_and_forces(by, &mut six);
-        widest(Spread { modes: &self.modes, six: &six, force });
-        work
+        with_registers(Gain { sites: self, by, q, force })
+    }
+
+    /// A force on each part (x, y, z), N.
+    #[inline(always)]
+    fn forces(&self, by: &MassForce) -> [Each; 3] {
+        let mut forces = [[0.0; SITES]; 3];
+        for (axis, forces) in forces.iter_mut().enumerate() {
+            let [x, y, z] = [by.gradient[(axis, 0)], by.gradient[(axis, 1)], by.gradient[(axis, 2)]];
+            for (i, force) in forces.iter_mut().enumerate() {
+                let change = x * self.places[0][i] + y * self.places[1][i] + z * self.places[2][i];
+                *force = self.mass[i] * (by.uniform[axis] + change);
+            }
+        }
+        forces
+    }
+
+    /// Returns the work of forces on the parts at `q` and adds its gradient to `force`.
+    ///
+    /// # Safety
+    /// That of [`Doubles`].
+    #[inline(always)]
+    unsafe fn gain<D: Doubles>(&self, forces: &[Each; 3], q: &[f64], force: &mut [f64]) -> f64 {
+        // SAFETY: The caller has the instruction set.
+        unsafe {
+            let mut six = self.reduce::<D>(q);
+            let work = bend(forces, &mut six);
+            self.spread::<D>(&six, force);
+            work
+        }
     }
 
     /// Linear displacement (m) and rotation (rad) of each part.
-    fn reduce(&self, q: &[f64]) -> [Each; 6] {
-        widest(Reduce { modes: &self.modes, q })
-    }
-
-    /// Returns the work for the six numbers of each part and replaces these numbers by the
-    /// derivatives of the work.
-    fn work_and_forces(&self, force: &MassForce, six: &mut [Each; 6]) -> f64 {
-        widest(Bend { sites: self, force, six })
-    }
-}
-
-/// The work on all parts, side by side.
-///
-/// The nonlinear part of a part's displacement is `A w x u + B w x (w x u)` (Choi and Ko 2005), so
-/// the work is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
-struct Bend<'a> {
-    sites: &'a MassSites,
-    force: &'a MassForce,
-    six: &'a mut [Each; 6],
-}
-
-impl Work for Bend<'_> {
-    type Out = f64;
+    ///
+    /// # Safety
+    /// That of [`Doubles`].
     #[inline(always)]
-    fn run(self) -> f64 {
-        let Self { sites: MassSites { mass, places, .. }, force, six } = self;
-        let mut weights = [[0.0; SITES]; 3];
-        for (axis, weights) in weights.iter_mut().enumerate() {
-            let [x, y, z] = [0, 1, 2].map(|of| force.gradient[(axis, of)]);
-            for i in 0..SITES {
-                let change = x * places[0][i] + y * places[1][i] + z * places[2][i];
-                weights[i] = mass[i] * (force.uniform[axis] + change);
-            }
-        }
-        let mut s = [0.0; SITES];
-        for i in 0..SITES {
-            s[i] = six[3][i] * six[3][i] + six[4][i] * six[4][i] + six[5][i] * six[5][i];
-        }
-        let [a, b, da, db] = coefficients_of(&s);
-        let mut work = [0.0; SITES];
-        for i in 0..SITES {
-            let [u, w] = [0, 3].map(|at| [six[at][i], six[at + 1][i], six[at + 2][i]]);
-            let g = [weights[0][i], weights[1][i], weights[2][i]];
-            let dot = |x: &[f64; 3], y: &[f64; 3]| x[0] * y[0] + x[1] * y[1] + x[2] * y[2];
-            let cross = |x: &[f64; 3], y: &[f64; 3]| {
-                [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
-            };
-            let (across, turned) = (cross(&u, &g), cross(&g, &w));
-            let (gw, wu, gu) = (dot(&g, &w), dot(&w, &u), dot(&g, &u));
-            let (once, twice) = (dot(&w, &across), gw * wu - s[i] * gu);
-            work[i] = a[i] * once + b[i] * twice;
-            let both = 2.0 * (da[i] * once + db[i] * twice);
-            for axis in 0..3 {
-                six[axis][i] = a[i] * turned[axis] + b[i] * (gw * w[axis] - s[i] * g[axis]);
-                six[3 + axis][i] = a[i] * across[axis]
-                    + b[i] * (wu * g[axis] + gw * u[axis] - 2.0 * gu * w[axis])
-                    + both * w[axis];
-            }
-        }
-        work.iter().sum()
-    }
-}
-
-/// Sums the displacements and rotations of the parts.
-struct Reduce<'a> {
-    modes: &'a [[Each; 6]],
-    q: &'a [f64],
-}
-
-impl Work for Reduce<'_> {
-    type Out = [Each; 6];
-    #[inline(always)]
-    fn run(self) -> [Each; 6] {
-        let mut six = [[0.0; SITES]; 6];
-        // The sums of one row fit into the registers.
-        for (k, sums) in six.iter_mut().enumerate() {
-            for (q, rows) in self.q.iter().zip(self.modes) {
-                for (sum, row) in sums.iter_mut().zip(&rows[k]) {
-                    *sum += q * row;
+    unsafe fn reduce<D: Doubles>(&self, q: &[f64]) -> Sixes {
+        let mut six = Sixes::ZERO;
+        // The sums of three rows fit into the registers.
+        for (half, six) in six.0.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            // SAFETY: The caller has the instruction set.
+            unsafe {
+                let mut sums = [[D::splat(0.0); 2]; 3];
+                for (q, Sixes(rows)) in q.iter().zip(&self.modes) {
+                    let q = D::splat(*q);
+                    for (sums, row) in sums.iter_mut().zip(&rows[3 * half..]) {
+                        for (sum, row) in sums.iter_mut().zip(row.as_chunks().0) {
+                            *sum = sum.add(q.mul(D::load(row)));
+                        }
+                    }
+                }
+                for (sums, six) in sums.iter().zip(six) {
+                    for (sum, six) in sums.iter().zip(six.as_chunks_mut().0) {
+                        sum.store(six);
+                    }
                 }
             }
         }
         six
     }
-}
 
-/// Adds the modal forces of forces on the parts.
-struct Spread<'a> {
-    modes: &'a [[Each; 6]],
-    six: &'a [Each; 6],
-    force: &'a mut [f64],
-}
-
-impl Work for Spread<'_> {
-    type Out = ();
+    /// Adds the modal forces of forces on the six numbers of the parts.
+    ///
+    /// # Safety
+    /// That of [`Doubles`].
     #[inline(always)]
-    fn run(self) {
-        for (force, rows) in self.force.iter_mut().zip(self.modes) {
-            let mut sums = [0.0; SITES];
-            for (row, part) in rows.iter().zip(self.six) {
-                for ((sum, row), part) in sums.iter_mut().zip(row).zip(part) {
-                    *sum += row * part;
-                }
+    unsafe fn spread<D: Doubles>(&self, six: &Sixes, force: &mut [f64]) {
+        /// Modes that share the loads of the forces.
+        const TOGETHER: usize = 4;
+        let (rows, last_rows) = self.modes[..force.len()].as_chunks::<TOGETHER>();
+        let (forces, last_forces) = force.as_chunks_mut::<TOGETHER>();
+        // SAFETY: The caller has the instruction set.
+        unsafe {
+            for (force, rows) in forces.iter_mut().zip(rows) {
+                add_sums::<D, TOGETHER>(rows, six, force);
             }
-            *force += sums.iter().sum::<f64>();
+            for (force, rows) in last_forces.iter_mut().zip(last_rows) {
+                add_sums::<D, 1>(std::array::from_ref(rows), six, std::array::from_mut(force));
+            }
         }
     }
 }
 
-/// Computes the bend force of gravity over a step, kg^1/2 m/s^2.
+/// Adds the products of the rows of some modes with forces on the parts, summed over the parts.
 ///
-/// This is the discrete gradient of Gonzalez (J. Nonlinear Sci. 6, 1996) around the mean of the
-/// forces at both ends. `force . (to - from)` then equals the work between both ends up to
-/// rounding. A force taken at the beginning of the step would add energy to a swinging body in
-/// every step. On entry `force` is that mean, on return it is the result. `work` is the work
-/// between both ends, J.
-pub(crate) fn between(from: &[f64], to: &[f64], work: f64, force: &mut [f64]) {
-    let way = || from.iter().zip(to).map(|(from, to)| to - from);
-    let square: f64 = way().map(|way| way * way).sum();
-    let along: f64 = way().zip(&*force).map(|(way, force)| way * force).sum();
-    let share = (work - along) / square;
-    // Without any motion there is no work, and the division yields no finite number.
-    if share.is_finite() {
-        force.iter_mut().zip(way()).for_each(|(force, way)| *force += share * way);
+/// # Safety
+/// That of [`Doubles`].
+#[inline(always)]
+unsafe fn add_sums<D: Doubles, const N: usize>(rows: &[Sixes; N], six: &Sixes, force: &mut [f64; N]) {
+    let mut partial = [[0.0; 8]; N];
+    // SAFETY: The caller has the instruction set.
+    unsafe {
+        let mut sums = [D::splat(0.0); N];
+        for k in 0..6 {
+            for at in 0..SITES / 8 {
+                let part = D::load(&six.0[k].as_chunks().0[at]);
+                for (sum, rows) in sums.iter_mut().zip(rows) {
+                    *sum = sum.add(part.mul(D::load(&rows.0[k].as_chunks().0[at])));
+                }
+            }
+        }
+        for (sum, partial) in sums.iter().zip(&mut partial) {
+            sum.store(partial);
+        }
+    }
+    for (force, s) in force.iter_mut().zip(&partial) {
+        *force += ((s[0] + s[4]) + (s[2] + s[6])) + ((s[1] + s[5]) + (s[3] + s[7]));
+    }
+}
+
+/// Returns the work for the six numbers of each part, on which `forces` act (N), and replaces
+/// these numbers by the derivatives of the work.
+///
+/// The nonlinear part of a part's displacement is `A w x u + B w x (w x u)` (Choi and Ko 2005), so
+/// the work is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
+#[inline(always)]
+fn bend(forces: &[Each; 3], Sixes(six): &mut Sixes) -> f64 {
+    let mut s = [0.0; SITES];
+    for i in 0..SITES {
+        s[i] = six[3][i] * six[3][i] + six[4][i] * six[4][i] + six[5][i] * six[5][i];
+    }
+    let [a, b, da, db] = coefficients_of(&s);
+    let mut work = [0.0; SITES];
+    for i in 0..SITES {
+        let (u, w) = ([six[0][i], six[1][i], six[2][i]], [six[3][i], six[4][i], six[5][i]]);
+        let g = [forces[0][i], forces[1][i], forces[2][i]];
+        let dot = |x: &[f64; 3], y: &[f64; 3]| x[0] * y[0] + x[1] * y[1] + x[2] * y[2];
+        let cross = |x: &[f64; 3], y: &[f64; 3]| {
+            [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+        };
+        let (across, turned) = (cross(&u, &g), cross(&g, &w));
+        let (gw, wu, gu) = (dot(&g, &w), dot(&w, &u), dot(&g, &u));
+        let (once, twice) = (dot(&w, &across), gw * wu - s[i] * gu);
+        work[i] = a[i] * once + b[i] * twice;
+        let both = 2.0 * (da[i] * once + db[i] * twice);
+        for axis in 0..3 {
+            six[axis][i] = a[i] * turned[axis] + b[i] * (gw * w[axis] - s[i] * g[axis]);
+            six[3 + axis][i] = a[i] * across[axis]
+                + b[i] * (wu * g[axis] + gw * u[axis] - 2.0 * gu * w[axis])
+                + both * w[axis];
+        }
+    }
+    work.iter().sum()
+}
+
+/// The work of `by` on the bend, and its gradient where `force` asks for it.
+struct Gain<'a> {
+    sites: &'a MassSites,
+    by: &'a MassForce,
+    q: &'a [f64],
+    force: &'a mut [f64],
+}
+
+impl Kernel for Gain<'_> {
+    type Out = f64;
+    #[inline(always)]
+    unsafe fn run<D: Doubles, L: Lanes>(self) -> f64 {
+        // SAFETY: The caller has the instruction set.
+        unsafe { self.sites.gain::<D>(&self.sites.forces(self.by), self.q, self.force) }
+    }
+}
+
+/// Scratch of [`BendStep`], one entry per mode.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct BendScratch {
+    /// Forces at the beginning and at the end of the step.
+    start: Vec<f64>,
+    end: Vec<f64>,
+    /// Force over the step, as the round computes it.
+    now: Vec<f64>,
+    /// Error of the force in the previous round, and the force which that round computed.
+    last_off: Vec<f64>,
+    last_now: Vec<f64>,
+}
+
+impl BendScratch {
+    pub(crate) fn new(modes: usize) -> Self {
+        let zero = vec![0.0; modes];
+        let [start, end, now, last_off, last_now] = std::array::from_fn(|_| zero.clone());
+        Self { start, end, now, last_off, last_now }
+    }
+}
+
+/// The force of `by` on the bend over one step, and the coordinates that it leads to.
+///
+/// The force is the discrete gradient of Gonzalez (J. Nonlinear Sci. 6, 1996) around the mean of
+/// the forces at both ends: its product with the way of the step is the work between both ends. A
+/// force taken at the beginning of the step would add energy to a swinging body in every step.
+pub(crate) struct BendStep<'a> {
+    pub(crate) sites: &'a MassSites,
+    pub(crate) by: &'a MassForce,
+    /// Change of each coordinate per unit modal force in the step.
+    pub(crate) response: &'a [f64],
+    /// Largest of them.
+    pub(crate) softest: f64,
+    /// Coordinates at the beginning of the step.
+    pub(crate) from: &'a [f64],
+    /// Coordinates at the end of the step: on entry without the force, on return with it.
+    pub(crate) to: &'a mut [f64],
+    /// Largest other force, kg^1/2 m/s^2.
+    pub(crate) largest: f64,
+    /// On return the force over the step, kg^1/2 m/s^2.
+    pub(crate) force: &'a mut [f64],
+    pub(crate) scratch: &'a mut BendScratch,
+}
+
+/// Force along a way per unit of it that does the work `missing`, or none where that is rounding.
+/// Without any motion there is no work, and the division yields no finite number.
+#[inline(always)]
+fn per_way(missing: f64, rounding: f64, square: f64) -> f64 {
+    let share = missing / square;
+    if missing.abs() > rounding && share.is_finite() { share } else { 0.0 }
+}
+
+/// Maximum number of rounds. The force changes the end of the step, which changes the force.
+const MAX_ROUNDS: usize = 12;
+
+/// Tolerance of the force over a step, as a share of the largest force.
+const SHARE: f64 = 1e-6;
+
+/// Part of a work below which it is rounding.
+const ROUNDING: f64 = 8.0 * f64::EPSILON;
+
+impl Kernel for BendStep<'_> {
+    type Out = ();
+    #[inline(always)]
+    unsafe fn run<D: Doubles, L: Lanes>(self) {
+        let Self { sites, by, response, softest, from, to, largest, force, scratch } = self;
+        let n = force.len();
+        let (response, from, to) = (&response[..n], &from[..n], &mut to[..n]);
+        let BendScratch { start, end, now, last_off, last_now } = scratch;
+        let (start, end, now) = (&mut start[..n], &mut end[..n], &mut now[..n]);
+        let (last_off, last_now) = (&mut last_off[..n], &mut last_now[..n]);
+        let forces = sites.forces(by);
+        // The first round takes the force at the beginning as constant.
+        start.fill(0.0);
+        // SAFETY: The caller has the instruction set.
+        let before = unsafe { sites.gain::<D>(&forces, from, start) };
+        force.copy_from_slice(start);
+        for k in 0..n {
+            to[k] += response[k] * start[k];
+        }
+        let enough = SHARE * largest;
+        let mut last_change = f64::INFINITY;
+        for round in 0..MAX_ROUNDS {
+            end.fill(0.0);
+            // SAFETY: The caller has the instruction set.
+            let after = unsafe { sites.gain::<D>(&forces, to, end) };
+            let gained = after - before;
+            let rounding = ROUNDING * (before.abs() + after.abs());
+            let (mut square, mut along, mut stiff) = (0.0, 0.0, 0.0);
+            for k in 0..n {
+                let (way, turn) = (to[k] - from[k], end[k] - start[k]);
+                now[k] = 0.5 * (start[k] + end[k]);
+                (square, along, stiff) = (square + way * way, along + way * now[k], stiff + turn * turn);
+            }
+            let share = per_way(gained - along, rounding, square);
+            let (mut change, mut on, mut turns) = (0.0f64, 0.0, 0.0);
+            for k in 0..n {
+                now[k] += share * (to[k] - from[k]);
+                let off = now[k] - force[k];
+                let turn = off - last_off[k];
+                (on, turns) = (on + off * turn, turns + turn * turn);
+                change = change.max(off.abs());
+            }
+            // The error shrinks from round to round along nearly the same line. This extrapolates
+            // to the point of the line with zero error (Anderson 1965, of depth one).
+            let back = if round > 0 && turns > 0.0 { (on / turns).clamp(-4.0, 4.0) } else { 0.0 };
+            let (mut moved, mut pulled) = (0.0, 0.0);
+            let mut square = 0.0;
+            for k in 0..n {
+                let next = now[k] - back * (now[k] - last_now[k]);
+                let further = response[k] * (next - force[k]);
+                (last_off[k], last_now[k]) = (now[k] - force[k], now[k]);
+                force[k] = next;
+                to[k] += further;
+                let way = to[k] - from[k];
+                moved += end[k] * further;
+                pulled += next * way;
+                square += way * way;
+            }
+            // What is left of the error is about the change times the rate at which it shrinks. The
+            // first round knows it from the stiffness of the force along the way.
+            let rate = if round > 0 { change / last_change } else { softest * (stiff / square).sqrt() };
+            last_change = change;
+            let done = change <= enough || change * rate.min(1.0) <= enough;
+            if done || round + 1 == MAX_ROUNDS {
+                // The force at the end knows the work up to the square of the last correction.
+                let share = per_way(gained + moved - pulled, rounding, square);
+                for k in 0..n {
+                    let further = share * (to[k] - from[k]);
+                    force[k] += further;
+                    to[k] += response[k] * further;
+                }
+                break;
+            }
+        }
     }
 }
 
@@ -292,7 +468,7 @@ mod tests {
     #[test]
     fn the_work_is_that_of_the_warp_and_the_force_its_gradient() {
         let places = [[0.0; SITES]; 3];
-        let mut sites = MassSites { mass: [0.0; SITES], places, modes: vec![[[0.0; SITES]; 6]; 6] };
+        let mut sites = MassSites { mass: [0.0; SITES], places, modes: vec![Sixes::ZERO; 6] };
         // The second part is at x = 2 m, where the force is another.
         sites.places[0][5] = 2.0;
         let uniform = Vector3::new(1.0, -9.0, 2.0);
@@ -301,8 +477,8 @@ mod tests {
         let gravity = MassForce { uniform, gradient };
         (sites.mass[0], sites.mass[5]) = (0.5, 2.0);
         for mode in 0..6 {
-            sites.modes[mode][mode][0] = 1.0;
-            sites.modes[mode][mode][5] = -0.3;
+            sites.modes[mode].0[mode][0] = 1.0;
+            sites.modes[mode].0[mode][5] = -0.3;
         }
         for turn in [1e-9, 0.1, 0.6, 2.0, 5.0, 9.0] {
             let q = [0.1, -0.2, 0.3, 0.8 * turn, -0.5 * turn, 0.3 * turn];

@@ -18,6 +18,7 @@ use super::{
     Frame, FrameMotion, Hand, RigidMotion, State, StepSettings,
     constraint::ViscoelasticPatch,
     elastic::ElasticStep,
+    gravity::BendScratch,
     modes::Modes,
     patch::{Grams, Six, Tangent},
     solve::System,
@@ -97,21 +98,18 @@ pub struct Kernel {
     model: Arc<ModalModel>,
     settings: StepSettings,
     h: f64,
-    modes: Modes,
+    /// Kernels with the same settings share this.
+    modes: Arc<Modes>,
     /// The nonlinear part of the step. `None` with linear elasticity.
     elastic: Option<ElasticStep>,
     creep: ViscoelasticPatch,
     before: State,
     /// Modal forces of gravity and loads, and at the end of a step those of the hands too. `pulls`
-    /// holds the modal forces of the hands.
+    /// holds the modal forces of gravity on the bent shape, and then those of the hands.
     force: Vec<f64>,
     pulls: Vec<f64>,
-    /// Modal forces that gravity adds on the bent shape: over the step, and at the beginning of the
-    /// step.
-    bend: Vec<f64>,
-    start: Vec<f64>,
-    /// Error of the bend force in the previous round, and the force which that round computed.
-    rounds: Vec<[f64; 2]>,
+    /// Scratch of gravity on the bent shape.
+    bend: BendScratch,
     /// Contact forces over this step.
     push: touch::ContactPush,
     solving: Vec<Solving>,
@@ -164,7 +162,7 @@ impl Kernel {
         h: f64,
     ) -> Result<Self, StepError> {
         settings.check()?;
-        let modes = Modes::new(&model, &settings, modes, h)?;
+        let modes = model.shared_modes().get(&model, &settings, modes, h)?;
         let zero = vec![0.0; modes.count()];
         let mut kernel = Self {
             elastic: elastic(&model, &settings, &modes, h, None),
@@ -172,9 +170,7 @@ impl Kernel {
             before: State::default(),
             force: zero.clone(),
             pulls: zero.clone(),
-            bend: zero.clone(),
-            start: zero.clone(),
-            rounds: vec![[0.0; 2]; zero.len()],
+            bend: BendScratch::new(zero.len()),
             push: touch::ContactPush { modal: zero, ..Default::default() },
             solving: Vec::new(),
             forces: Vec::new(),
@@ -196,7 +192,7 @@ impl Kernel {
     /// Returns the errors of [`Kernel::new`]. The old settings and step length then stay.
     pub fn reconfigure(&mut self, settings: StepSettings, h: f64) -> Result<(), StepError> {
         settings.check()?;
-        self.modes = Modes::new(&self.model, &settings, self.modes.count(), h)?;
+        self.modes = self.model.shared_modes().get(&self.model, &settings, self.modes.count(), h)?;
         let shapes = self.held_shapes().cloned();
         self.elastic = elastic(&self.model, &settings, &self.modes, h, shapes);
         self.creep = ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h);

@@ -24,4 +24,5 @@ pub use state::State;
 
 pub(crate) use gravity::MassSites;
 pub(crate) use kernel::group;
+pub(crate) use modes::SharedModes;
 pub(crate) use patch::{Six, Tangent, contact_floor, displacement, residual, tangent};

@@ -1,11 +1,57 @@
 //! The recurrences of all modes, stored by column, so that loops over the modes vectorize.
 
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+
 use super::{State, StepSettings};
 use crate::{Coefficients, Integrator, ModalModel, StepError};
+
+/// The coefficients of a model that kernels have, each with what it was made for. Kernels with the
+/// same settings share theirs, so that the steps of a crowd find them in the cache.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct SharedModes(Arc<Mutex<Vec<Weak<Modes>>>>);
+
+impl SharedModes {
+    /// Returns what [`Modes::new`] makes, or the same made before.
+    pub(crate) fn get(
+        &self,
+        model: &ModalModel,
+        settings: &StepSettings,
+        count: usize,
+        h: f64,
+    ) -> Result<Arc<Modes>, StepError> {
+        let of = MadeFor::new(model, settings, count, h);
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(modes) = known.iter().filter_map(Weak::upgrade).find(|modes| modes.made_for == of) {
+            return Ok(modes);
+        }
+        let modes = Arc::new(Modes::new(model, settings, count, h)?);
+        known.retain(|modes| modes.strong_count() > 0);
+        known.push(Arc::downgrade(&modes));
+        Ok(modes)
+    }
+}
+
+/// What coefficients depend on besides the model.
+#[derive(Debug, Clone, PartialEq)]
+struct MadeFor {
+    /// The settings without the gravity of the scene.
+    settings: StepSettings,
+    count: usize,
+    /// Length of the step, s.
+    h: f64,
+}
+
+impl MadeFor {
+    fn new(model: &ModalModel, settings: &StepSettings, count: usize, h: f64) -> Self {
+        let settings = StepSettings { gravity: [0.0; 3], ..*settings };
+        Self { settings, count: count.min(model.mode_count()), h }
+    }
+}
 
 /// Coefficients of one step for every mode.
 #[derive(Debug, Clone)]
 pub(crate) struct Modes {
+    made_for: MadeFor,
     /// Angular frequencies as stepped, rad/s.
     pub(crate) omega: Vec<f64>,
     /// Damping coefficients as stepped, 1/s.
@@ -15,6 +61,8 @@ pub(crate) struct Modes {
     free: [[Vec<f64>; 4]; 3],
     /// Change of q, v, a per unit modal force.
     pub(crate) response: [Vec<f64>; 3],
+    /// Largest change of a coordinate per unit modal force.
+    pub(crate) softest: f64,
     /// Whether the step also uses the old acceleration and force.
     memory: bool,
     viscous: Option<Viscous>,
@@ -39,7 +87,8 @@ impl Modes {
         count: usize,
         h: f64,
     ) -> Result<Self, StepError> {
-        let count = count.min(model.mode_count());
+        let made_for = MadeFor::new(model, settings, count, h);
+        let count = made_for.count;
         let (omega, damping): (Vec<f64>, Vec<f64>) =
             (0..count).map(|mode| settings.mode(model, mode)).unzip();
         let reduced = settings.is_reduced(model);
@@ -63,12 +112,14 @@ impl Modes {
             response: branches.iter().map(|f| f.response).collect(),
         });
         Ok(Self {
+            made_for,
             omega,
             damping,
             free: std::array::from_fn(|row| {
                 std::array::from_fn(|column| made.iter().map(|c| c.free[row][column]).collect())
             }),
             response: std::array::from_fn(|row| made.iter().map(|c| c.response[row]).collect()),
+            softest: made.iter().fold(0.0, |most, c| c.response[0].max(most)),
             memory: settings.integrator != Integrator::Exact && !reduced,
             viscous,
             relaxes: settings.relaxation.is_some(),
@@ -122,12 +173,22 @@ impl Modes {
 
     /// Adds the response to a further modal force within the step.
     pub(crate) fn respond(&self, force: &[f64], state: &mut State) {
-        let viscous = self.viscous.as_ref().map(|viscous| &viscous.response);
-        let rows = [&mut state.q, &mut state.v, &mut state.a, &mut state.z];
-        for (response, out) in self.response.iter().chain(viscous).zip(rows) {
-            for ((out, response), force) in out.iter_mut().zip(response).zip(force) {
-                *out += response * force;
-            }
+        add_response(&self.response[0], force, &mut state.q);
+        self.respond_beyond(force, state);
+    }
+
+    /// Adds the same response to all but the coordinates, which have it.
+    pub(crate) fn respond_beyond(&self, force: &[f64], state: &mut State) {
+        add_response(&self.response[1], force, &mut state.v);
+        add_response(&self.response[2], force, &mut state.a);
+        if let Some(viscous) = &self.viscous {
+            add_response(&viscous.response, force, &mut state.z);
         }
+    }
+}
+
+fn add_response(response: &[f64], force: &[f64], out: &mut [f64]) {
+    for ((out, response), force) in out.iter_mut().zip(response).zip(force) {
+        *out += response * force;
     }
 }

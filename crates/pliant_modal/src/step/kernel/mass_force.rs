@@ -3,9 +3,12 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::Kernel;
-use crate::step::{
-    Frame, FrameMotion, State,
-    gravity::{MassForce, between},
+use crate::{
+    simd::with_registers,
+    step::{
+        Frame, FrameMotion, State,
+        gravity::{BendStep, MassForce},
+    },
 };
 
 impl Kernel {
@@ -81,48 +84,14 @@ impl Kernel {
     /// Adds the effect of `by` on the bend between both shapes of the step to the step without
     /// hands.
     pub(super) fn bend_under(&mut self, by: &MassForce, state: &mut State) {
-        /// Maximum number of rounds. The force changes the end of the step, which changes the
-        /// force.
-        const MAX_ROUNDS: usize = 12;
-        /// Tolerance of the bend force, as a share of the largest force.
-        const SHARE: f64 = 1e-6;
-        let sites = self.model.mass_sites();
-        let enough = SHARE * self.force.iter().fold(0.0f64, |most, f| most.max(f.abs()));
-        // The first round takes the force at the beginning as constant. `pulls` is the change of a
-        // round.
-        self.start.fill(0.0);
-        let before = sites.add(by, &self.before.q, &mut self.start);
-        self.bend.copy_from_slice(&self.start);
-        self.pulls.copy_from_slice(&self.start);
-        self.modes.respond(&self.pulls, state);
-        for round in 0..MAX_ROUNDS {
-            self.pulls.copy_from_slice(&self.start);
-            let work = sites.add(by, &state.q, &mut self.pulls) - before;
-            self.pulls.iter_mut().for_each(|force| *force *= 0.5);
-            between(&self.before.q, &state.q, work, &mut self.pulls);
-            let mut change = 0.0f64;
-            let (mut along, mut square) = (0.0, 0.0);
-            for ((bend, now), [last_off, _]) in self.bend.iter().zip(&self.pulls).zip(&self.rounds) {
-                let off = now - bend;
-                let turn = off - last_off;
-                (along, square) = (along + off * turn, square + turn * turn);
-                change = change.max(off.abs());
-            }
-            // The error shrinks from round to round along nearly the same line. This extrapolates
-            // to the point of the line with zero error (Anderson 1965, of depth one).
-            let back = if round > 0 && square > 0.0 { (along / square).clamp(-4.0, 4.0) } else { 0.0 };
-            let here = self.bend.iter_mut().zip(&mut self.pulls).zip(&mut self.rounds);
-            for ((bend, now), [last_off, last_now]) in here {
-                let next = *now - back * (*now - *last_now);
-                (*last_off, *last_now) = (*now - *bend, *now);
-                (*bend, *now) = (next, next - *bend);
-            }
-            self.modes.respond(&self.pulls, state);
-            if change <= enough {
-                break;
-            }
-        }
-        for (force, bend) in self.force.iter_mut().zip(&self.bend) {
+        let (modes, sites) = (&self.modes, self.model.mass_sites());
+        let largest = self.force.iter().fold(0.0f64, |most, f| most.max(f.abs()));
+        let (response, softest) = (&modes.response[0][..], modes.softest);
+        let (from, to) = (&self.before.q[..], &mut state.q[..]);
+        let (force, scratch) = (&mut self.pulls[..], &mut self.bend);
+        with_registers(BendStep { sites, by, response, softest, from, to, largest, force, scratch });
+        self.modes.respond_beyond(&self.pulls, state);
+        for (force, bend) in self.force.iter_mut().zip(&self.pulls) {
             *force += bend;
         }
     }
