@@ -464,6 +464,7 @@ impl Kernel for BendStep<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simd::with_arrays;
 
     #[test]
     fn the_work_is_that_of_the_warp_and_the_force_its_gradient() {
@@ -499,6 +500,82 @@ mod tests {
                 };
                 let slope = (at(1e-5) - at(-1e-5)) / 2e-5;
                 assert!((force[mode] - slope).abs() < 1e-8, "{turn}, {mode}: {} {slope}", force[mode]);
+            }
+        }
+    }
+
+    /// Parts whose numbers follow no rule.
+    fn scattered(modes: usize) -> MassSites {
+        let value = |seed: usize| ((seed * seed + 7 * seed) as f64).sin();
+        let each = |seed: usize| std::array::from_fn(|i| value(31 * seed + i));
+        let row = |mode: usize| Sixes(std::array::from_fn(|k| each(10 * mode + k + 5)));
+        MassSites {
+            mass: each(1).map(f64::abs),
+            places: [each(2), each(3), each(4)],
+            modes: (0..modes).map(row).collect(),
+        }
+    }
+
+    const GRAVITY: MassForce = MassForce {
+        uniform: Vector3::new(1.0, -9.0, 2.0),
+        gradient: Matrix3::new(0.1, 0.2, -0.4, 0.3, 0.0, 0.1, -0.2, 0.3, 0.5),
+    };
+
+    /// Copies of a body on different processors agree to the bit only if their sums do.
+    #[test]
+    fn all_registers_have_the_same_bits() {
+        for modes in [1, 4, 7, 20] {
+            let sites = scattered(modes);
+            for size in [0.01, 0.3, 2.0] {
+                let q: Vec<f64> = (0..modes).map(|k| size * (3.0 * k as f64 + 1.0).cos()).collect();
+                let [mut wide, mut plain] = [vec![0.0; modes], vec![0.0; modes]];
+                let by = &GRAVITY;
+                let works = [
+                    with_registers(Gain { sites: &sites, by, q: &q, force: &mut wide }),
+                    with_arrays(Gain { sites: &sites, by, q: &q, force: &mut plain }),
+                ];
+                assert_eq!(works[0].to_bits(), works[1].to_bits(), "{modes} modes, {size}");
+                assert_eq!(wide, plain, "{modes} modes, {size}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_force_of_a_step_is_the_discrete_gradient_and_does_the_work() {
+        for (modes, soft) in [(3, 1e-3), (7, 1e-3), (20, 2e-4), (20, 1e-5)] {
+            let sites = scattered(modes);
+            let response: Vec<f64> = (0..modes).map(|k| soft / (1.0 + k as f64)).collect();
+            let from: Vec<f64> = (0..modes).map(|k| 0.2 * (k as f64).cos() / (1.0 + k as f64)).collect();
+            let free: Vec<f64> = from.iter().enumerate().map(|(k, q)| q + 0.05 * (k as f64).sin()).collect();
+            let (mut to, mut force) = (free.clone(), vec![0.0; modes]);
+            let largest = 100.0;
+            with_registers(BendStep {
+                sites: &sites,
+                by: &GRAVITY,
+                response: &response,
+                softest: response[0],
+                from: &from,
+                to: &mut to,
+                largest,
+                force: &mut force,
+                scratch: &mut BendScratch::new(modes),
+            });
+            let way: Vec<f64> = to.iter().zip(&from).map(|(to, from)| to - from).collect();
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let gained = sites.work(&GRAVITY, &to) - sites.work(&GRAVITY, &from);
+            let done = dot(&force, &way);
+            // The tolerance of the force is not one of the work.
+            let most = 1e-3 * SHARE * largest * dot(&way, &way).sqrt();
+            assert!((done - gained).abs() < most, "{done} and {gained} J, more than {most} J");
+            let mut mean = vec![0.0; modes];
+            sites.add(&GRAVITY, &from, &mut mean);
+            sites.add(&GRAVITY, &to, &mut mean);
+            mean.iter_mut().for_each(|force| *force *= 0.5);
+            let share = (gained - dot(&mean, &way)) / dot(&way, &way);
+            for k in 0..modes {
+                let exact = mean[k] + share * way[k];
+                assert!((force[k] - exact).abs() < 2.0 * SHARE * largest, "{} and {exact}", force[k]);
+                assert!((to[k] - free[k] - response[k] * force[k]).abs() < 1e-12);
             }
         }
     }

@@ -192,3 +192,30 @@ fn add_response(response: &[f64], force: &[f64], out: &mut [f64]) {
         *out += response * force;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bodies_with_the_same_settings_share_their_coefficients() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bud.modal");
+        let model = ModalModel::read(path).unwrap();
+        let get = |settings: &StepSettings, h| {
+            SharedModes::get(model.shared_modes(), &model, settings, usize::MAX, h).unwrap()
+        };
+        let settings = StepSettings::default();
+        let one = get(&settings, 0.01);
+        // The coefficients do not depend on the gravity of the scene.
+        let heavy = StepSettings { gravity: [0.0, -9.81, 0.0], ..settings };
+        assert!(Arc::ptr_eq(&one, &get(&heavy, 0.01)));
+        let stiff = get(&StepSettings { stiffness_scale: 2.0, ..settings }, 0.01);
+        assert!(stiff.omega[0] > one.omega[0]);
+        let fast = get(&settings, 0.02);
+        assert!(fast.response[0][0] > one.response[0][0]);
+        // What nobody has any more is forgotten.
+        drop((one, stiff));
+        get(&settings, 0.03);
+        assert_eq!(model.shared_modes().0.lock().unwrap().len(), 2);
+    }
+}
