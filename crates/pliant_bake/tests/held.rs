@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use pliant_bake::{Bake, BakeConfig, Material, PrescribedPatch, StaticLoads, bake, deflect};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
@@ -493,6 +494,7 @@ fn a_body_of_which_one_of_two_hands_lets_go_gains_nothing() {
             let stored = |body: &Body| {
                 let (force, c) =
                     (body.mean_reaction(grabs[0].0).unwrap(), body.compliance(grabs[0].0).unwrap());
+                let force = body.frame().rotation().inverse() * Vector3::from(force);
                 let along = |i: usize| (0..3).map(|j| force[i] * c[i][j] * force[j]).sum::<f64>();
                 body.energy() + 0.5 * (0..3).map(along).sum::<f64>()
             };

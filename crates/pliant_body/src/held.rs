@@ -13,7 +13,7 @@ use crate::{BodyState, Driven, ModalBody};
 
 /// The own shapes of the patches that hands hold, of all bodies with reduced elasticity.
 ///
-/// Shapes take up to some seconds to make. They are made on Bevy's compute threads when a hand
+/// Shapes take up to ten seconds to make. They are made on Bevy's compute threads when a hand
 /// takes hold, and made anew for where the hand is when it has led the patch farther
 /// ([`HeldShapes::wanted`]); the old ones serve until then. Until there are any, the hand feels
 /// what the coordinates of the model leave out as a mere compliance. Shapes that were made once

@@ -80,8 +80,8 @@ impl Body {
     }
 
     /// The patches that are held and where they are, oldest first. Where a hand still comes back
-    /// from the place that other shapes put it to ([`Body::set_held_shapes`]), it is taken for back:
-    /// shapes for the place on the way would put it elsewhere again.
+    /// from the place that other shapes put it to ([`Body::set_held_shapes`]), it is taken for
+    /// back: shapes for the place on the way would put it elsewhere again.
     pub fn held_places(&self) -> impl ExactSizeIterator<Item = HeldPlace> + Clone + '_ {
         let back = self.state.frame.rotation().inverse();
         self.hands.iter().zip(&self.grabs).map(move |(hand, grab)| {
@@ -98,8 +98,8 @@ impl Body {
     }
 
     /// Makes the own shapes of the held patches anew where those that the body has do not suffice
-    /// ([`HeldShapes::wanted`]). That takes half a second to some seconds: a
-    /// game makes them beside its frames.
+    /// ([`HeldShapes::wanted`]). That takes half a second for a hand and up to ten seconds for two:
+    /// a game makes them beside its frames.
     /// Returns whether the body has got others.
     ///
     /// # Errors
@@ -120,7 +120,8 @@ impl Body {
         let shapes = HeldShapes::of_places(self.model(), &places)?.map(Arc::new);
         // Of the same patches and of more, the old ones are better than none.
         let is_of = |own: &HeldShapes, place: &HeldPlace| own.places().any(|made| made.key() == place.key());
-        let serve = |own: &Arc<HeldShapes>| places.iter().all(|place| is_of(own, place));
+        let serve =
+            |own: &Arc<HeldShapes>| !places.is_empty() && places.iter().all(|place| is_of(own, place));
         let changes = shapes.is_some() || self.held_shapes().is_some_and(|own| !serve(own));
         if shapes.is_none() {
             self.without = places;

@@ -72,8 +72,7 @@ const EFFORTS: [Effort; HeldShapes::MAX_PATCHES] = [
     Effort { corrections: 6, enough: 5e-4, end: 1.0, kept: 12, points: 3, candidates: 16_000 },
 ];
 
-/// The same around hands that are at rest. With fewer or more corrections there, a free bar that was
-/// then torn by 70 % swung more and more.
+/// The same around hands that are at rest.
 const AT_REST: [Effort; HeldShapes::MAX_PATCHES] = [
     Effort { corrections: 3, enough: 5e-4, end: 1.0, kept: 6, points: 3, candidates: 4_000 },
     Effort { corrections: 3, enough: 5e-4, end: 1.0, kept: 8, points: 3, candidates: 4_000 },

@@ -5,7 +5,8 @@
 //! shapes of second order of their pairs (modal derivatives of the static shapes, S. R. Idelsohn
 //! and A. Cardona, *A reduction method for nonlinear structural dynamic analysis*, CMAME 49, 1985).
 //! These columns are solved on the region, which is the elements around the patches, when a hand
-//! takes hold, and vanish beyond it. The static shapes of two hands reach over the whole body. What
+//! takes hold, and vanish beyond it. The static shapes of two hands on an anchored body reach over
+//! all of it. What
 //! the coordinates have of the columns is then taken out, so that coordinates mean the same with
 //! and without them:
 //!
@@ -99,7 +100,7 @@ const NEAR_SHARE: f64 = 0.1;
 
 /// The own shapes of the patches that hands hold on a body with reduced elasticity.
 ///
-/// They are made for where the hands are, which takes half a second to some seconds, and shared by
+/// They are made for where the hands are, which takes half a second to ten seconds, and shared by
 /// all copies of the body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeldShapes {

@@ -25,9 +25,10 @@ const LEAST: f64 = 0.3;
 /// Maximum number of elements around one patch.
 const MAX_ELEMENTS: usize = 2_000;
 
-/// Maximum number of elements around one of two patches on which its static shapes are solved. What
+/// Maximum number of elements around one of two patches of an anchored body on which its static
+/// shapes are solved. What
 /// a body gives farther from a hand is smooth, but the coordinates do not have all of it: two hands
-/// that sheared a bunny were off by 21 % with static shapes that ended at the region. A single hand
+/// that sheared a bunny were off by 23 % with static shapes that ended at the region. A single hand
 /// feels it as a compliance ([`super::left_out`]). Four hands that twist the end of a bar move
 /// little beyond the region, and were off by 6 % with static shapes of the whole body.
 const FAR_ELEMENTS: usize = 12_000;
@@ -119,7 +120,10 @@ impl<'a> Region<'a> {
             numbers
         };
         let near = around(LEAST, MAX_ELEMENTS);
-        let far = if patches.len() == 2 { around(f64::INFINITY, FAR_ELEMENTS) } else { near.clone() };
+        // Nothing holds the shapes of a free body beyond the region.
+        let is_anchored = (0..mesh.node_count() as u32).any(|node| mesh.is_anchored(node));
+        let reaches_far = patches.len() == 2 && is_anchored;
+        let far = if reaches_far { around(f64::INFINITY, FAR_ELEMENTS) } else { near.clone() };
         let elements = sorted(near.iter().flatten().copied().collect());
         let beyond: Vec<u32> = sorted(far.iter().flatten().copied().collect());
         let beyond: Vec<u32> = beyond.into_iter().filter(|e| elements.binary_search(e).is_err()).collect();
@@ -162,19 +166,8 @@ impl<'a> Region<'a> {
             nodes.map(|((own, all), anchored)| own == all && !anchored).collect()
         };
         let free_near: Vec<Vec<bool>> = near.iter().map(|around| inner(around, near_count)).collect();
+        let free = far.iter().map(|around| inner(around, numbers.len())).collect();
         // Something must hold the shapes of a free body.
-        let held = |free: Vec<bool>, near: &[bool]| {
-            if free.iter().all(|free| *free) {
-                let beyond = std::iter::repeat_n(false, numbers.len() - near.len());
-                return near.iter().copied().chain(beyond).collect();
-            }
-            free
-        };
-        let free = far
-            .iter()
-            .zip(&free_near)
-            .map(|(around, near)| held(inner(around, numbers.len()), near))
-            .collect();
         let mut free_for_any = inner(&elements, near_count);
         if let (true, Some(first)) = (free_for_any.iter().all(|free| *free), free_near.first()) {
             free_for_any.clone_from(first);

@@ -97,7 +97,8 @@ pub enum Hold {
     Target {
         /// Position of the hand, m, world axes.
         target: Vector3<f64>,
-        /// Velocity of the hand, m/s, world axes. Only the damper uses this value.
+        /// Velocity of the hand over the step, m/s, world axes. The damper uses it, and the
+        /// guard of the energy, for which the way of the target is what the hand supplies.
         velocity: Vector3<f64>,
         /// Spring and damper of the hand.
         config: GrabConfig,

@@ -395,8 +395,11 @@ impl Kernel for BendStep<'_> {
         let (start, end, now) = (&mut start[..n], &mut end[..n], &mut now[..n]);
         let (last_off, last_now) = (&mut last_off[..n], &mut last_now[..n]);
         let forces = sites.forces(by);
-        // The first round takes the force at the beginning as constant.
+        // The first round takes the force at the beginning as constant. What an earlier step has
+        // left must not count: it may not be finite.
         start.fill(0.0);
+        last_off.fill(0.0);
+        last_now.fill(0.0);
         // SAFETY: The caller has the instruction set.
         let before = unsafe { sites.gain::<D>(&forces, from, start) };
         force.copy_from_slice(start);

@@ -15,7 +15,7 @@ use nalgebra::{Matrix3, Vector3};
 use group::{Parts, View};
 
 use super::{
-    Frame, FrameMotion, Hand, RigidMotion, State, StepSettings,
+    Frame, FrameMotion, Hand, Hold, RigidMotion, State, StepSettings,
     constraint::ViscoelasticPatch,
     elastic::ElasticStep,
     gravity::BendScratch,
@@ -79,6 +79,16 @@ struct Solving {
     arm: Vector3<f64>,
     /// Force on the body over the step, N, body axes.
     pull: Vector3<f64>,
+    /// Whether the target is farther away than the hand may pull.
+    is_capped: bool,
+}
+
+impl Solving {
+    /// Whether all that the hand does is to stretch a spring between its target and the patch.
+    fn is_plain(&self, hand: &Hand) -> bool {
+        let is_target = matches!(hand.hold, Hold::Target { .. });
+        is_target && !self.is_capped && self.relaxation == 0.0 && self.creep_displacement == Vector3::zeros()
+    }
 }
 
 /// Steps states of one model. No other type steps bodies.
@@ -209,8 +219,8 @@ impl Kernel {
     /// Hands on other patches feel what the modes leave out as a compliance, as all hands do
     /// without shapes. The shapes of `state` come to rest under the forces of `hands`, so that
     /// these go on as they were, and so do stiff coordinates where the patches are others. Where
-    /// nobody holds a patch of the old shapes any more, the body gains no energy: what it would gain
-    /// is taken from its velocities, and where these do not suffice the coordinates yield.
+    /// nobody holds a patch of the old shapes any more, the body gains no energy: what it would
+    /// gain is taken from its velocities, and where these do not suffice the coordinates yield.
     ///
     /// # Errors
     /// Returns [`StepError::OtherModel`] for shapes of another model, and [`StepError::Length`] for
@@ -230,10 +240,7 @@ impl Kernel {
         let before = before.filter(|elastic| state.s.len() == elastic.columns());
         let before = before.map(|elastic| elastic.energy(state));
         let is_let_go = self.held_shapes().is_some_and(|shapes| !shapes.are_all_held(hands));
-        let have_changed = match (self.held_shapes(), &shapes) {
-            (Some(old), Some(new)) => !old.are_of_patches_of(new),
-            (old, new) => old.is_some() != new.is_some(),
-        };
+        let old = self.held_shapes().cloned();
         let mut force = vec![0.0; state.q.len()];
         self.elastic_force(state, &mut force);
         state.s.clear();
@@ -243,6 +250,10 @@ impl Kernel {
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
         self.equilibrate_columns(state, hands);
+        let have_changed = match (&old, self.held_shapes()) {
+            (Some(old), Some(new)) => !old.are_of_patches_of(new),
+            (old, new) => old.is_some() != new.is_some(),
+        };
         if let (Some(elastic), true) = (&mut self.elastic, have_changed && !hands.is_empty()) {
             elastic.settle(state, &force);
         }
@@ -526,7 +537,9 @@ impl Kernel {
         });
         let mut report = StepReport::default();
         if !hands.is_empty() || self.elastic.is_some() {
-            report = self.hold(state, hands, rigid);
+            let is_alone = !self.push.is_on && load.torque == Vector3::zeros();
+            let weight = is_alone.then(|| self.model.mass() * gravity + load.force);
+            report = self.hold(state, hands, rigid, weight);
         }
         state.f.copy_from_slice(&self.force);
         report

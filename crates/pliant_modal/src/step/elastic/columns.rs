@@ -57,6 +57,11 @@ impl ElasticStep {
             state.s.clear();
             state.s.extend_from_slice(columns);
             state.q.copy_from_slice(modal);
+            let mut now = vec![0.0; force.len()];
+            self.force_at(state, &mut now);
+            for (a, (force, now)) in state.a.iter_mut().zip(force.iter().zip(&now)) {
+                *a += force - now;
+            }
         }
     }
 
@@ -185,11 +190,12 @@ impl ElasticStep {
                     }
                 }
             }
-            place(&mut all, best.1);
             now = best.0;
             if best.1 == 0.0 {
+                all.copy_from_slice(&begun);
                 break;
             }
+            place(&mut all, best.1);
         }
         // The rounds slow down where the energy is not convex. The shape then shrinks as a whole,
         // down to rest, where there is no energy.
@@ -208,7 +214,11 @@ impl ElasticStep {
                     high = share;
                 }
             }
-            scale(low);
+            if low > 0.0 {
+                scale(low);
+            } else {
+                all.fill(0.0);
+            }
         }
         let (columns, modal) = all.split_at(self.columns);
         state.s.clear();

@@ -57,11 +57,15 @@ impl Kernel {
     }
 
     /// Solves for the forces of all hands and adds their effect to the state.
+    ///
+    /// `weight` is the force of gravity and loads on a free body (N, world axes), if nothing else
+    /// acts on its frame.
     pub(super) fn hold(
         &mut self,
         state: &mut State,
         hands: &mut [Hand],
         mut rigid: Option<RigidMotion>,
+        weight: Option<Vector3<f64>>,
     ) -> StepReport {
         self.prepare(hands);
         self.begin(state, hands);
@@ -114,39 +118,51 @@ impl Kernel {
             hand.patch.rows().spread(forces, warp, &mut self.pulls);
         }
         let [force, torque] = self.total(&place);
-        // What the hands give to the motion of the frame, J.
-        let mut carried = 0.0;
+        let unheld = state.frame;
         if let Some(rigid) = &rigid {
-            let unheld = state.frame.kinetic_energy(&self.model);
             rigid.apply(&mut state.frame, &self.model, force, torque + place.slack(rigid));
-            carried = state.frame.kinetic_energy(&self.model) - unheld;
         }
         if let Some(elastic) = &mut self.elastic {
-            let ends = [&self.before.q[..], elastic.coordinates()];
             let shapes = elastic.shapes();
-            let is_led =
-                |hand: &Hand| matches!(hand.hold, Hold::Target { .. }) && hand.mean != Vector3::zeros();
-            let are_led = hands.iter().all(is_led);
-            let supplied: f64 = hands
-                .iter()
-                .zip(&self.solving)
-                .map(|(hand, solving)| {
-                    let stored = |q: &[f64], force: &Vector3<f64>| {
-                        0.5 * force.dot(&(turned(&self.creep, shapes, hand, q) * force))
-                    };
-                    let force = &solving.pull;
-                    match hand.hold {
-                        // The hand supplies the residual flexibility of its patch first. That turns
-                        // with the patch, and must not give back more than it got.
-                        Hold::Target { velocity, .. } if is_led(hand) && (are_led || rigid.is_none()) => {
-                            let before = stored(ends[0], &(place.back * hand.mean));
-                            self.h * force.dot(&(place.back * velocity)) + before - stored(ends[1], force)
-                        }
-                        _ => force.dot(&elastic.patch_displacement(&hand.patch)),
-                    }
-                })
-                .sum();
-            let supplied = if are_led { supplied - carried } else { supplied };
+            // What a hand stores in its spring and in the residual flexibility of its patch, J.
+            // That turns with the patch, and must not give back more than it got.
+            let stored = |hand: &Hand, q: &[f64], force: &Vector3<f64>| {
+                0.5 * force.dot(&(turned(&self.creep, shapes, hand, q) * force))
+            };
+            let back = self.before.frame.rotation().inverse();
+            let released = |hand: &Hand, solving: &Solving| {
+                stored(hand, &self.before.q, &(back * hand.mean))
+                    - stored(hand, elastic.coordinates(), &solving.pull)
+            };
+            let both = || hands.iter().zip(&self.solving);
+            // The work of a hand by the way of its target. Just after it has taken hold, its target
+            // has no way.
+            let led = |(hand, solving): (&Hand, &Solving)| match hand.hold {
+                Hold::Target { velocity, .. } if hand.mean != Vector3::zeros() => {
+                    let way = self.h * solving.pull.dot(&(place.back * velocity));
+                    Some(way + released(hand, solving))
+                }
+                _ => None,
+            };
+            let on_shape =
+                |hand: &Hand, solving: &Solving| solving.pull.dot(&elastic.patch_displacement(&hand.patch));
+            let supplied = match (&rigid, weight) {
+                // What moves the frame of a free body does not deform it. The way of the frame that
+                // the hands cause is one in the load, too.
+                (Some(rigid), Some(weight)) if both().all(|(hand, solving)| solving.is_plain(hand)) => {
+                    let gained = |frame: &Frame| frame.kinetic_energy(&self.model);
+                    let carried = gained(&state.frame) - gained(&unheld) - weight.dot(&rigid.way(force));
+                    both().map(led).sum::<Option<f64>>().map(|supplied| supplied - carried)
+                }
+                _ => None,
+            };
+            let supplied = supplied.unwrap_or_else(|| {
+                let work = |(hand, solving)| match led((hand, solving)) {
+                    Some(work) if !self.model.is_free() => work,
+                    _ => on_shape(hand, solving),
+                };
+                both().map(work).sum()
+            });
             elastic.finish(&self.before, supplied, &mut self.force, state);
         } else {
             self.modes.respond(&self.pulls, state);
@@ -257,6 +273,7 @@ impl Kernel {
                     if gap.norm() > self.model.size() {
                         gap = gap.cap_magnitude(self.model.size());
                         solving.beyond = 0.0;
+                        solving.is_capped = true;
                     }
                     if config.relaxation > 0.0 {
                         let frame =
