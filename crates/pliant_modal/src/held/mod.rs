@@ -243,7 +243,7 @@ impl HeldShapes {
         let left =
             |(patch, rows): (&Patch, &cubature::Rows)| left_out(model, patch, rows, patches.len() == 1);
         let residuals = patches.iter().zip(&rows).map(left).collect::<Result<_, _>>()?;
-        let effort = Effort::of(patch_displacements);
+        let effort = Effort::of(patch_displacements, &region);
         let Some(rule) = rule(model, &region, law, (&columns, &shapes), effort) else { return Ok(None) };
         let omega = columns.omega(model);
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());

@@ -77,6 +77,8 @@ pub(super) struct Region<'a> {
     free_for_any: Vec<bool>,
     /// Stiffness of the region's elements.
     stiffness: Stiffness,
+    /// Whether the body is anchored anywhere.
+    is_anchored: bool,
     /// Stiffness of all elements, where there are some beyond the region.
     far_stiffness: Option<Stiffness>,
 }
@@ -191,6 +193,7 @@ impl<'a> Region<'a> {
             free_near,
             free_for_any,
             stiffness,
+            is_anchored,
             far_stiffness,
         }
     }
@@ -198,6 +201,11 @@ impl<'a> Region<'a> {
     /// Whether every patch's shapes are held somewhere: at an anchor or where the region ends.
     pub(super) fn is_held(&self) -> bool {
         self.free_near.iter().all(|free| free.iter().any(|free| !free))
+    }
+
+    /// Whether the body is anchored anywhere.
+    pub(super) fn is_anchored(&self) -> bool {
+        self.is_anchored
     }
 
     /// Number of nodes of the region and beyond it.
