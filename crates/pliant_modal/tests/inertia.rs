@@ -1,4 +1,4 @@
-//! Bodies whose anchors move, against closed forms.
+//! Bodies whose anchors move, against closed forms, and one under gravity after a failed step.
 
 use crate::nonlinear_rod;
 use crate::rod;
@@ -179,5 +179,29 @@ fn a_free_body_ignores_the_motion_and_a_wild_number_is_refused() {
     for bad in [f64::NAN, f64::INFINITY] {
         let motion = FrameMotion { angular_velocity: [0.0, bad, 0.0], ..Default::default() };
         assert!(body.set_frame_motion(motion).is_err());
+    }
+}
+
+/// A step that fails leaves nothing in the scratch of gravity on the bent shape.
+#[test]
+fn a_body_under_gravity_recovers_from_a_step_that_fails() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bud.modal");
+    let model = Arc::new(ModalModel::read(path).unwrap());
+    let settings = StepSettings { gravity: [0.0, -9.81, 0.0], ..Default::default() };
+    let mut body = Body::new(model, settings.into()).unwrap();
+    for _ in 0..10 {
+        body.step().unwrap();
+    }
+    let before = body.state().clone();
+    for huge in [1e90, 1e150, 1e300, f64::MAX] {
+        let mut state = before.clone();
+        (state.q[0], state.v[1], state.a[2]) = (huge, -huge, huge);
+        body.set_state(&state).unwrap();
+        let refused = (0..100).filter(|_| body.step().is_err()).count();
+        assert!(refused <= 1, "{huge}: {refused} steps were refused");
+        body.set_state(&before).unwrap();
+        for _ in 0..100 {
+            body.step().unwrap();
+        }
     }
 }
