@@ -241,12 +241,13 @@ impl Kernel {
         let before = before.map(|elastic| elastic.energy(state));
         let is_let_go = self.held_shapes().is_some_and(|shapes| !shapes.are_all_held(hands));
         let old = self.held_shapes().cloned();
-        let mut force = vec![0.0; state.q.len()];
-        self.elastic_force(state, &mut force);
-        state.s.clear();
-        if self.elastic.is_none() {
+        let Some(step) = &self.elastic else {
+            state.s.clear();
             return Ok(());
-        }
+        };
+        let mut force = vec![0.0; state.q.len()];
+        step.force_at(state, &mut force);
+        state.s.clear();
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
         self.equilibrate_columns(state, hands);
