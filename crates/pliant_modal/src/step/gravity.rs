@@ -524,21 +524,48 @@ mod tests {
         gradient: Matrix3::new(0.1, 0.2, -0.4, 0.3, 0.0, 0.1, -0.2, 0.3, 0.5),
     };
 
+    /// The bits of a step's force and of the coordinates that it leads to.
+    fn bits(modes: usize, size: f64, run: &dyn Fn(BendStep<'_>)) -> Vec<u64> {
+        let sites = scattered(modes);
+        let response = vec![1e-4; modes];
+        let from: Vec<f64> = (0..modes).map(|k| size * (3.0 * k as f64 + 1.0).cos()).collect();
+        let mut to: Vec<f64> = from.iter().map(|q| 1.1 * q + 0.02).collect();
+        let mut force = vec![0.0; modes];
+        run(BendStep {
+            sites: &sites,
+            by: &GRAVITY,
+            response: &response,
+            softest: 1e-4,
+            from: &from,
+            to: &mut to,
+            largest: 1.0,
+            force: &mut force,
+            scratch: &mut BendScratch::new(modes),
+        });
+        force.iter().chain(&to).map(|x| x.to_bits()).collect()
+    }
+
     /// Copies of a body on different processors agree to the bit only if their sums do.
     #[test]
     fn all_registers_have_the_same_bits() {
-        for modes in [1, 4, 7, 20] {
-            let sites = scattered(modes);
-            for size in [0.01, 0.3, 2.0] {
-                let q: Vec<f64> = (0..modes).map(|k| size * (3.0 * k as f64 + 1.0).cos()).collect();
-                let [mut wide, mut plain] = [vec![0.0; modes], vec![0.0; modes]];
-                let by = &GRAVITY;
-                let works = [
-                    with_registers(Gain { sites: &sites, by, q: &q, force: &mut wide }),
-                    with_arrays(Gain { sites: &sites, by, q: &q, force: &mut plain }),
-                ];
-                assert_eq!(works[0].to_bits(), works[1].to_bits(), "{modes} modes, {size}");
-                assert_eq!(wide, plain, "{modes} modes, {size}");
+        for (modes, size) in [(1, 0.01), (4, 2.0), (7, 0.3), (20, 0.01), (20, 0.3), (20, 2.0)] {
+            let plain = bits(modes, size, &|step| with_arrays(step));
+            assert!(plain.iter().any(|&x| x != 0));
+            assert!(bits(modes, size, &|step| with_registers(step)) == plain, "{modes} modes, {size}");
+            #[cfg(target_arch = "x86_64")]
+            {
+                use crate::simd::x86::{kernel_avx2, kernel_avx512};
+                let has_fma = std::arch::is_x86_feature_detected!("fma");
+                if has_fma && std::arch::is_x86_feature_detected!("avx2") {
+                    // SAFETY: The check above found AVX2 and FMA.
+                    let wide = bits(modes, size, &|step| unsafe { kernel_avx2(step) });
+                    assert!(wide == plain, "{modes} modes, {size}, AVX2");
+                }
+                if has_fma && std::arch::is_x86_feature_detected!("avx512f") {
+                    // SAFETY: The check above found AVX-512F and FMA.
+                    let wide = bits(modes, size, &|step| unsafe { kernel_avx512(step) });
+                    assert!(wide == plain, "{modes} modes, {size}, AVX-512");
+                }
             }
         }
     }
